@@ -1,0 +1,184 @@
+"""The global step: a sparse system factored once, solved in every iteration (Eq. 4.5).
+
+The free unknowns are eliminated from the fixed ones beforehand: a factor holds the matrix of the
+free vertices only, takes (..., 3, n) right-hand sides, ignores their fixed entries and returns
+zeros there. All its shapes depend on the number of vertices alone, so another handle set runs the
+code that is compiled already.
+"""
+
+import itertools
+import weakref
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from cholespy import CholeskySolverD, CholeskySolverF, MatrixType
+from jaxtyping import Array, Bool, Float, Int
+
+# Up to this many vertices the inverse is kept as a dense matrix (one product per solve, no call
+# back to the host). Measured in docs/benchmarks.md: the two cross between 700 and 1,500 vertices.
+DENSE_BELOW = 1000
+
+
+class NotPositiveDefinite(Exception):
+    """The matrix of the free vertices has no Cholesky factor."""
+
+
+class DenseFactor(eqx.Module):
+    """The inverse as a dense (n, n) matrix with zero rows and columns at the fixed vertices."""
+
+    inverse: Float[Array, "n n"]
+
+    def solve(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed vertices."""
+        return right @ self.inverse
+
+
+class SparseFactor(eqx.Module):
+    """A supernodal Cholesky factor on the host (CHOLMOD through cholespy), reached by number.
+
+    The factor is C++ memory, not an array. Held as a static field it would be hashed by identity,
+    and each new handle set would recompile everything. So the traced part is a number, a leaf like
+    any other, and the host looks the factor up in a table that does not keep it alive.
+    """
+
+    number: Int[Array, ""]
+
+    def solve(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed vertices."""
+
+        def host(_matvec, b):
+            return jax.pure_callback(
+                _solve_on_host,
+                jax.ShapeDtypeStruct(b.shape, b.dtype),
+                self.number,
+                b,
+                vmap_method="broadcast_all",
+            )
+
+        # custom_linear_solve gives the derivatives: a symmetric solve is its own adjoint. The
+        # operator itself is never applied, because the matrix has no tangent.
+        return jax.lax.custom_linear_solve(lambda x: x, right, host, symmetric=True)
+
+
+class Anchor:
+    """Keeps host factors alive for as long as the problem that uses them.
+
+    As a static field it takes part in jit's cache key, so all anchors compare equal: another
+    handle set is no reason to compile again.
+    """
+
+    def __init__(self, *factors: "_HostFactor | None") -> None:
+        """Hold on to the factors."""
+        self._factors = factors
+
+    def __eq__(self, other: object) -> bool:
+        """Return True for any other anchor."""
+        return isinstance(other, Anchor)
+
+    def __hash__(self) -> int:
+        """Return the hash that all anchors share."""
+        return hash(Anchor)
+
+
+class _HostFactor:
+    """Factors on first use, because the start's matrix is not needed by those who bring a start."""
+
+    def __init__(self, matrix: sp.spmatrix, free: Bool[np.ndarray, "n"], dtype: np.dtype) -> None:
+        self.index = np.flatnonzero(free)
+        self.matrix: sp.csc_matrix | None = matrix[self.index][:, self.index].tocsc()
+        self.dtype = np.dtype(dtype)
+        self.solver = None
+
+    def factorise(self) -> None:
+        if self.solver is not None or not len(self.index):
+            return
+        coo = self.matrix.tocoo()
+        kind = CholeskySolverF if self.dtype == np.float32 else CholeskySolverD
+        try:
+            self.solver = kind(
+                len(self.index),
+                coo.row.astype(np.int32),
+                coo.col.astype(np.int32),
+                coo.data.astype(np.float64),
+                MatrixType.COO,
+            )
+        except ValueError as error:
+            raise NotPositiveDefinite(str(error)) from error
+        self.matrix = None
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        out = np.zeros(right.shape, right.dtype)
+        if not len(self.index):
+            return out
+        self.factorise()
+        flat = right.reshape(-1, right.shape[-1])
+        b = np.ascontiguousarray(flat[:, self.index].T)
+        x = np.zeros_like(b)
+        self.solver.solve(b, x)
+        out.reshape(flat.shape)[:, self.index] = x.T
+        return out
+
+
+_factors: "weakref.WeakValueDictionary[int, _HostFactor]" = weakref.WeakValueDictionary()
+_numbers = itertools.count()
+
+
+def _solve_on_host(number, right):
+    number, right = np.asarray(number), np.asarray(right)
+    if number.ndim == 0:
+        return _lookup(int(number)).solve(right)
+    if (number == number.flat[0]).all():
+        return _lookup(int(number.flat[0])).solve(right)  # one factor, many columns together
+    lead = number.ndim
+    out = np.empty(right.shape, right.dtype)
+    for at in np.ndindex(*right.shape[:lead]):
+        out[at] = _lookup(int(np.broadcast_to(number, right.shape[:lead])[at])).solve(right[at])
+    return out
+
+
+def _lookup(number: int) -> _HostFactor:
+    try:
+        return _factors[number]
+    except KeyError:
+        raise RuntimeError(
+            "the factor of this problem is gone: keep the problem that precompute returned alive "
+            "while functions made from it run, and make it in the process that uses it"
+        ) from None
+
+
+Factor = DenseFactor | SparseFactor
+
+
+def factorise(
+    matrix: sp.spmatrix, free: Bool[np.ndarray, "n"], dtype: np.dtype, *, lazy: bool = False
+) -> tuple[Factor, "_HostFactor | None"]:
+    """Return a factor of the free part of a symmetric positive definite matrix (n, n).
+
+    With it comes what an :class:`Anchor` must hold, None for a dense factor.
+
+    ``lazy`` puts the work off until the first solve (sparse factors only).
+
+    **Raises** NotPositiveDefinite.
+    """
+    n = matrix.shape[0]
+    if n <= DENSE_BELOW:
+        index = np.flatnonzero(free)
+        inverse = np.zeros((n, n))
+        if len(index):
+            block = matrix.tocsr()[index][:, index].toarray()
+            try:
+                lower = np.linalg.cholesky(block)
+            except np.linalg.LinAlgError as error:
+                raise NotPositiveDefinite(str(error)) from error
+            half = np.linalg.solve(lower, np.eye(len(index)))
+            inverse[np.ix_(index, index)] = half.T @ half
+        return DenseFactor(jnp.asarray(inverse, dtype)), None
+    host = _HostFactor(matrix.tocsr(), free, dtype)
+    if not lazy:
+        host.factorise()
+    number = next(_numbers)
+    _factors[number] = host
+    return SparseFactor(jnp.asarray(number, jnp.int32)), host

@@ -1,0 +1,562 @@
+"""The local step: the transformation of each cell, given the deformed vertices (Sec. 4.1.1).
+
+Every solver here minimises, for each cell on its own (Eq. 4.2, in the cell's principal frame,
+where B is diagonal; energy.py),
+
+    phi(T) = lambda |T^T T - I|^2 + tr(T B T^T) - 2 tr(T C).
+
+The problem has several minima. All solvers start from the proper polar rotation R of C^T, so T is
+a function of p' alone and p'(lambda) is smooth: warm-starting T from the last iteration makes that
+curve noisy (4e-4) and wrong at large lambda; starting from the identity sticks at a bend of 90
+degrees; starting from the affine fit gives inverted cells.
+
+``Newton`` is the default because it is the fastest that reaches the minimum. It is measured
+against the alternatives in docs/benchmarks.md.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Matrices = Float[Array, "3 3 n"]
+Vectors = Float[Array, "3 n"]
+Scalars = Float[Array, "n"]
+# One component of all cells at a time: plain Python lists of (n,) arrays, so that every product
+# below is one contiguous, vectorised pass, and small matrices cost no transposition.
+Grid = list[list[Array]]
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+class LocalStep(Protocol):
+    """What ``deform(..., local=)`` takes: one of the five solvers of this file."""
+
+    def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return T (deformed axis, rest axis, cell) for C, diagonal B and lambda."""
+        ...
+
+    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return t, known to be ``minimize(c, b, rigidity)``, with the derivatives of that."""
+        ...
+
+
+def fit(local: LocalStep, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    """Run a local step; its iterations are not differentiated, its solution is."""
+    t = local.minimize(*map(jax.lax.stop_gradient, (c, b, rigidity)))
+    return local.attach(t, c, b, rigidity)
+
+
+class _Material:
+    """Solvers of Eq. 4.2 share the derivative of its solution."""
+
+    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return t with the derivatives of the minimiser (implicit function theorem)."""
+        return _attach_material(t, c, b, rigidity)
+
+
+@dataclass(frozen=True)
+class Newton(_Material):
+    """Damped Newton on the exact gradient (Eq. 4.3) and Hessian; never raises the energy.
+
+    First up to 16 quasi-Newton steps with the block diagonal of the Hessian, which in the principal
+    frame is nearly all of it (three scalars and three 2x2 blocks); then exact 9x9 steps, only on
+    the cells that still need them.
+    """
+
+    max_steps: int = 60
+    """Bound on the exact steps of a cell; two are usual."""
+
+    def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return the minimisers T (3, 3, n)."""
+        rotation = polar_rotation(c)
+        r, cl = _grid(rotation), _grid(c)
+        m = _product(cl, r)  # symmetric: C = U S V^T gives C R = U S U^T
+        x = _block_newton(m, list(b), rigidity)
+        x = _newton_on_hardest(x, m, list(b), rigidity, self.max_steps)
+        return _stack(_product(r, x))
+
+
+@dataclass(frozen=True)
+class LBFGS(_Material):
+    """jaxopt's L-BFGS, one cell at a time under vmap: the reference solver.
+
+    With the backtracking line search, which is six times faster here than jaxopt's default one.
+    """
+
+    tol: float = 1e-10
+    """Stop at this gradient norm, relative to the cell's size."""
+    max_steps: int = 200
+
+    def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return the minimisers T (3, 3, n)."""
+        import jaxopt  # slow to import, and only the reference needs it
+
+        solver = jaxopt.LBFGS(
+            _cell_objective,
+            tol=self.tol,
+            maxiter=self.max_steps,
+            linesearch="backtracking",
+            maxls=8,
+            implicit_diff=False,
+        )
+
+        def one_cell(start, c, b, lam):
+            return solver.run(start, c, b, lam).params
+
+        c, b, lam = _scaled(c, b, rigidity)
+        return jax.vmap(one_cell, in_axes=-1, out_axes=-1)(polar_rotation(c), c, b, lam)
+
+
+@dataclass(frozen=True)
+class GradientDescent(_Material):
+    """The thesis's own solver: gradient descent on Eq. 4.3, here with a safe fixed step.
+
+    The step is one over a bound on the curvature along the way, so that the energy cannot rise.
+    """
+
+    max_steps: int = 500
+
+    def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return the minimisers T (3, 3, n)."""
+        c, b, lam = _scaled(c, b, rigidity)
+        start = polar_rotation(c)
+        # phi(T) <= phi(R) bounds |T|; the Hessian of phi is below 4 lambda (3 |T|^2) + 2 b there.
+        size = jnp.sqrt(jnp.sum(c * c, axis=(0, 1)))
+        bound = 1.0 + size / jnp.maximum(lam + jnp.min(b, axis=0), 1e-6)
+        rate = 1.0 / (12.0 * lam * jnp.minimum(bound, 4.0) ** 2 + 2.0 * jnp.max(b, axis=0) + 1e-12)
+
+        def one_cell(start, c, b, lam, rate):
+            grad = jax.grad(_cell_objective)
+            step = lambda _, t: t - rate * grad(t, c, b, lam)  # noqa: E731
+            return jax.lax.fori_loop(0, self.max_steps, step, start)
+
+        return jax.vmap(one_cell, in_axes=-1, out_axes=-1)(start, c, b, lam, rate)
+
+
+@dataclass(frozen=True)
+class RotationFit:
+    """The closest proper rotation (ARAP's local step, Sorkine and Alexa 2007); lambda is unused."""
+
+    def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return the rotations R (3, 3, n) that maximise tr(R C)."""
+        del b, rigidity
+        return polar_rotation(c)
+
+    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return t with the derivatives of the polar rotation."""
+        del b, rigidity
+        return _attach_rotation(t, c)
+
+
+@dataclass(frozen=True)
+class AffineFit:
+    """The best linear map, with no resistance to strain (Eq. 4.6): the limit lambda -> 0.
+
+    In directions in which the cell has no extent (the normal of a flat one) any map fits; there
+    it is the rotation of :class:`RotationFit`.
+    """
+
+    def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return T (3, 3, n) with ``T B = C^T``."""
+        del rigidity
+        floor = 1e3 * jnp.finfo(c.dtype).eps * jnp.max(jnp.abs(b), axis=0, keepdims=True)
+        floor = jnp.maximum(floor, jnp.finfo(c.dtype).tiny)
+        rotation = polar_rotation(c)
+        pull = (b + floor)[None]
+        return (jnp.swapaxes(c, 0, 1) + floor[None] * rotation) / pull
+
+    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+        """Return t with the derivatives of the linear fit, those of lambda = 0."""
+        return _attach_material(t, c, b, jnp.zeros_like(rigidity))
+
+
+# ---------------------------------------------------------------- the material fit's derivative
+
+
+@jax.custom_jvp
+def _attach_material(t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    del c, b, rigidity
+    return t
+
+
+@_attach_material.defjvp
+def _attach_material_jvp(primals, tangents):
+    """Differentiate the condition grad phi(T) = 0 instead of the iterations.
+
+    ``H dT = dC^T - T dB - 2 (T T^T T - T) dlambda`` with H half the Hessian. A prototype that
+    differentiated the iterations took 40 s to compile.
+    """
+    t, c, b, rigidity = primals
+    _, dc, db, dlam = tangents
+    tg = _grid(t)
+    gram = _product(_transpose(tg), tg)
+    excess = _product(tg, _minus_identity(gram))
+    right = [
+        [dc[j, i] - tg[i][j] * db[j] - 2.0 * excess[i][j] * dlam for j in range(3)]
+        for i in range(3)
+    ]
+    hessian = _hessian(tg, list(b), rigidity)
+    scale = rigidity + jnp.max(jnp.abs(b), axis=0)
+    floor = jnp.finfo(c.dtype).eps * scale + jnp.finfo(c.dtype).tiny
+    solution = _ldl_solve(hessian, [v for row in right for v in row], floor)
+    return t, _stack([[solution[3 * i + j] for j in range(3)] for i in range(3)])
+
+
+def _cell_objective(t, c, b, lam):
+    """Eq. 4.2 for one cell, (3, 3); the form that jaxopt and the thesis's descent see."""
+    strain = t.T @ t - jnp.eye(3, dtype=t.dtype)
+    return lam * jnp.sum(strain**2) + jnp.sum(t**2 * b[None, :]) - 2.0 * jnp.sum(t * c.T)
+
+
+def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:
+    """Divide each cell's problem by its size, so that one tolerance fits all."""
+    size = rigidity + jnp.max(jnp.abs(b), axis=0)
+    size = jnp.where(size > 0, size, 1.0)
+    return c / size[None, None], b / size[None], rigidity / size
+
+
+# ---------------------------------------------------------------- Newton
+
+
+def _half_gradient(x: Grid, m: Grid, b: list[Array], lam: Array) -> tuple[Grid, Grid, Grid]:
+    gram = _product(_transpose(x), x)
+    outer = _product(x, _transpose(x))
+    middle = [
+        [
+            2.0 * lam * (gram[i][j] - 1.0) + b[i] if i == j else 2.0 * lam * gram[i][j]
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
+    g = _product(x, middle)
+    return [[g[i][j] - m[j][i] for j in range(3)] for i in range(3)], gram, outer
+
+
+def _norm(g: Grid) -> Array:
+    return jnp.sqrt(sum(v * v for row in g for v in row))
+
+
+def _tolerance(m: Grid, lam: Array) -> Array:
+    """Gradient norm at which a cell is done: 1e-11 (float64) or 1e-5 (float32) of its scale."""
+    return jnp.finfo(lam.dtype).eps ** 0.7 * (lam + _norm(m)) + jnp.finfo(lam.dtype).tiny
+
+
+def _block_newton(m: Grid, b: list[Array], lam: Array) -> Grid:
+    """Quasi-Newton from X = I with the block diagonal of the Hessian.
+
+    At X = I and diagonal B the blocks ARE the Hessian, and they stay close: measured with strains
+    of 5 %, the relative gradient is 3e-6 after two steps and 1e-12 after six; a step costs 1 ms for
+    51,200 cells, an exact one 13 ms. Cells that stop getting better are left to the exact steps.
+    """
+    start = _identity(lam)
+    tolerance = _tolerance(m, lam)
+    tiny = jnp.finfo(lam.dtype).eps * (lam + sum(jnp.abs(v) for v in b))
+    tiny = tiny + jnp.finfo(lam.dtype).tiny
+
+    def advance(state):
+        step, x, g, best, busy = state
+        gram, outer = _product(_transpose(x), x), _product(x, _transpose(x))
+        y = [[x[i][j] for j in range(3)] for i in range(3)]
+        for i in range(3):
+            h = 2.0 * lam * (outer[i][i] + gram[i][i] + x[i][i] ** 2 - 1.0) + b[i]
+            y[i][i] = x[i][i] - g[i][i] / jnp.where(jnp.abs(h) > tiny, h, tiny)
+        for i, j in _PAIRS:
+            hi = 2.0 * lam * (outer[i][i] + gram[j][j] + x[i][j] ** 2 - 1.0) + b[j]
+            hj = 2.0 * lam * (outer[j][j] + gram[i][i] + x[j][i] ** 2 - 1.0) + b[i]
+            hij = 2.0 * lam * x[i][i] * x[j][j]
+            det = hi * hj - hij * hij
+            small = tiny * (jnp.abs(hi) + jnp.abs(hj) + tiny)
+            det = jnp.where(jnp.abs(det) > small, det, small)
+            y[i][j] = x[i][j] - (hj * g[i][j] - hij * g[j][i]) / det
+            y[j][i] = x[j][i] - (hi * g[j][i] - hij * g[i][j]) / det
+        g_new = _half_gradient(y, m, b, lam)[0]
+        size = _norm(g_new)
+        # A gradient that does not shrink means a poor model here: freeze the cell for later.
+        better = busy & (size < 0.9 * best)
+        x, g = _where(better, y, x), _where(better, g_new, g)
+        best = jnp.where(better, size, best)
+        return step + 1, x, g, best, better & (best > tolerance)
+
+    g = _half_gradient(start, m, b, lam)[0]
+    size = _norm(g)
+    state = (0, start, g, size, size > tolerance)
+    state = jax.lax.while_loop(lambda s: jnp.any(s[4]) & (s[0] < 16), advance, state)
+    return state[1]
+
+
+def _newton_on_hardest(x: Grid, m: Grid, b: list[Array], lam: Array, max_steps: int) -> Grid:
+    """Exact Newton on the cells that still need it, a few at a time.
+
+    Usually they are none, and the loop does not run; a mesh with degenerate triangles has some.
+    """
+    n = lam.shape[0]
+    few = min(n, max(64, n // 64))
+    tolerance = _tolerance(m, lam)
+    solve = jax.vmap(partial(_newton_cell, max_steps), in_axes=-1, out_axes=-1)
+    m, b = _stack(m), jnp.stack(b)
+
+    def advance(state):
+        x, waiting = state
+        (chosen,) = jnp.nonzero(waiting, size=few, fill_value=n)
+        pick = lambda v: v.at[..., chosen].get(mode="clip")  # noqa: E731
+        solved = solve(pick(x), pick(m), pick(b), pick(lam), pick(tolerance))
+        x = x.at[..., chosen].set(solved, mode="drop")
+        return x, waiting.at[chosen].set(False, mode="drop")
+
+    waiting = ~(_norm(_half_gradient(x, _grid(m), list(b), lam)[0]) <= tolerance)
+    x, _ = jax.lax.while_loop(lambda state: jnp.any(state[1]), advance, (_stack(x), waiting))
+    return _grid(x)
+
+
+def _newton_cell(max_steps: int, x, m, b, lam, tolerance) -> Float[Array, "3 3"]:
+    """Levenberg-damped Newton with the 9x9 Hessian; a step that raises the energy is refused.
+
+    Should the quasi-Newton steps have ended above the energy of the rotation (they may, at extreme
+    strain), the cell starts again from there, X = I.
+    """
+    identity = jnp.eye(3, dtype=x.dtype)
+    eps = jnp.finfo(x.dtype).eps
+    scale = lam + jnp.sum(jnp.abs(b)) + jnp.sum(jnp.abs(m))
+
+    def half_gradient(x):
+        return 2.0 * lam * (x @ x.T @ x - x) + x * b[None] - m.T
+
+    def half_hessian(x):
+        curvature = (
+            jnp.einsum("ik,lj->ijkl", identity, x.T @ x)
+            + jnp.einsum("il,kj->ijkl", x, x)
+            + jnp.einsum("ik,jl->ijkl", x @ x.T - identity, identity)
+        )
+        stretch = jnp.einsum("ik,jl->ijkl", identity, jnp.diag(b))
+        return (2.0 * lam * curvature + stretch).reshape(9, 9)
+
+    def advance(state):
+        step, x, before, damping = state
+        matrix = half_hessian(x) + damping * jnp.eye(9, dtype=x.dtype)
+        factor = jax.lax.linalg.cholesky(matrix)  # not a number unless positive definite
+        half = jax.scipy.linalg.solve_triangular(factor, half_gradient(x).reshape(9), lower=True)
+        move = jax.scipy.linalg.solve_triangular(factor.T, half, lower=False).reshape(3, 3)
+        after = _cell_objective(x - move, m, b, lam)
+        # Near the minimum two energies differ by rounding alone, hence the allowance.
+        good = after <= before + 8.0 * eps * scale
+        raised = jnp.maximum(4.0 * damping, 1e-3 * scale)
+        lowered = jnp.where(damping > 1e-6 * scale, 0.1 * damping, 0.0)
+        return (
+            step + 1,
+            jnp.where(good, x - move, x),
+            jnp.where(good, after, before),
+            jnp.where(good, lowered, raised),
+        )
+
+    def unsolved(state):
+        step, x, _, _ = state
+        return (jnp.linalg.norm(half_gradient(x)) > tolerance) & (step < max_steps)
+
+    here, fresh = _cell_objective(x, m, b, lam), _cell_objective(identity, m, b, lam)
+    x = jnp.where(here <= fresh, x, identity)
+    state = (0, x, jnp.where(here <= fresh, here, fresh), jnp.zeros_like(lam))
+    return jax.lax.while_loop(unsolved, advance, state)[1]
+
+
+def _hessian(x: Grid, b: list[Array], lam: Array) -> list[list[Array]]:
+    """Half the Hessian of phi at X as a full 9x9 (only its lower half is read)."""
+    gram, outer = _product(_transpose(x), x), _product(x, _transpose(x))
+    rows: list[list[Array]] = []
+    for i in range(3):
+        for j in range(3):
+            row = []
+            for k in range(3):
+                for l in range(3):  # noqa: E741
+                    value = x[i][l] * x[k][j]
+                    if l == j:
+                        value = value + outer[i][k]
+                    if i == k:
+                        value = value + gram[l][j]
+                    if (i, j) == (k, l):
+                        row.append(2.0 * lam * (value - 1.0) + b[j])
+                    else:
+                        row.append(2.0 * lam * value)
+            rows.append(row)
+    return rows
+
+
+def _ldl_solve(matrix: list[list[Array]], right: list[Array], floor: Array) -> list[Array]:
+    """Solve the symmetric 9x9 systems by LDL^T, unrolled into scalars: 13 ms for 51,200 cells.
+
+    A pivot below ``floor`` (a direction with no stiffness) is replaced by it.
+    """
+    size = len(right)
+    lower: list[list[Array]] = [[matrix[0][0]] * size for _ in range(size)]
+    diagonal: list[Array] = []
+    for j in range(size):
+        scaled = [lower[j][k] * diagonal[k] for k in range(j)]
+        pivot = matrix[j][j] - sum(lower[j][k] * scaled[k] for k in range(j))
+        diagonal.append(jnp.where(jnp.abs(pivot) > floor, pivot, floor))
+        for i in range(j + 1, size):
+            value = matrix[i][j] - sum(lower[i][k] * scaled[k] for k in range(j))
+            lower[i][j] = value / diagonal[j]
+    y = list(right)
+    for i in range(size):
+        y[i] = y[i] - sum(lower[i][k] * y[k] for k in range(i))
+    y = [y[i] / diagonal[i] for i in range(size)]
+    for i in reversed(range(size)):
+        y[i] = y[i] - sum(lower[k][i] * y[k] for k in range(i + 1, size))
+    return y
+
+
+# ---------------------------------------------------------------- the polar rotation
+
+
+def polar_rotation(c: Matrices) -> Matrices:
+    """Return the proper rotations R (det +1) that maximise tr(R C), cell by cell.
+
+    ``C = U S V^T`` gives ``R = V U^T``; where C is singular or its own reflection is closer, the
+    direction of the least singular value takes the sign. One-sided Jacobi (Hestenes 1958) on C
+    itself, since C^T C would square the condition of thin cells: 5 ms for 51,200 cells, where
+    LAPACK's batched SVD takes 130.
+    """
+    g = _grid(c)
+    # Scaled to the order of 1, since the sweeps square the entries.
+    size = jnp.max(jnp.abs(c), axis=(0, 1))
+    g = [[v / jnp.where(size > 0, size, 1.0) for v in row] for row in g]
+    v = _identity(size)
+
+    def sweep(_, state):
+        g, v = [list(row) for row in state[0]], [list(row) for row in state[1]]
+        for p, q in _PAIRS:
+            _orthogonalise(g, v, p, q)
+        return g, v
+
+    # Five sweeps leave 2e-16 between the columns in all of 51,200 random cells; four do too.
+    g, v = jax.lax.fori_loop(0, 5, sweep, (g, v))
+    length = [sum(g[k][i] ** 2 for k in range(3)) for i in range(3)]
+    for i, j in _PAIRS:
+        # Longest column first; the sign change keeps det V = +1.
+        swap = length[i] < length[j]
+        length[i], length[j] = (
+            jnp.where(swap, length[j], length[i]),
+            jnp.where(swap, length[i], length[j]),
+        )
+        for matrix in (g, v):
+            for k in range(3):
+                first, second = matrix[k][i], matrix[k][j]
+                matrix[k][i] = jnp.where(swap, second, first)
+                matrix[k][j] = jnp.where(swap, -first, second)
+    columns = _transpose(v)
+    # Where C has no first or second direction (an empty or collapsed cell), keep V's own.
+    u1 = _unit([g[k][0] for k in range(3)], columns[0])
+    second = [g[k][1] for k in range(3)]
+    along = _inner(u1, second)
+    second = [second[k] - along * u1[k] for k in range(3)]
+    u2 = _unit(second, _perpendicular(u1, columns))
+    u3 = _cross(u1, u2)
+    u = [u1, u2, u3]
+    return _stack([[sum(v[a][k] * u[k][i] for k in range(3)) for i in range(3)] for a in range(3)])
+
+
+@jax.custom_jvp
+def _attach_rotation(rotation: Matrices, c: Matrices) -> Matrices:
+    del c
+    return rotation
+
+
+@_attach_rotation.defjvp
+def _attach_rotation_jvp(primals, tangents):
+    """``dR = R [w]x`` with ``(tr(M) I - M) w = axial(N - N^T)``, M = C R, N = R^T dC^T."""
+    rotation, c = primals
+    dc = tangents[1]
+    r, rt = _grid(rotation), _transpose(_grid(rotation))
+    m = _product(_grid(c), r)
+    n = _product(rt, [[dc[j, i] for j in range(3)] for i in range(3)])
+    trace = m[0][0] + m[1][1] + m[2][2]
+    s = [
+        [(trace if i == j else 0.0) - 0.5 * (m[i][j] + m[j][i]) for j in range(3)] for i in range(3)
+    ]
+    axial = [n[2][1] - n[1][2], n[0][2] - n[2][0], n[1][0] - n[0][1]]
+    cofactor = [_cross(s[1], s[2]), _cross(s[2], s[0]), _cross(s[0], s[1])]
+    det = _inner(s[0], cofactor[0])
+    floor = jnp.finfo(c.dtype).eps * jnp.abs(trace) ** 3 + jnp.finfo(c.dtype).tiny
+    det = jnp.where(jnp.abs(det) > floor, det, jnp.inf)  # no unique rotation: no derivative
+    w = [sum(cofactor[k][i] * axial[k] for k in range(3)) / det for i in range(3)]
+    zero = jnp.zeros_like(trace)
+    skew = [[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]]
+    return rotation, _stack(_product(r, skew))
+
+
+def _orthogonalise(g: Grid, v: Grid, p: int, q: int) -> None:
+    """Turn columns p and q of G until they are orthogonal, and V along (in place)."""
+    difference = sum(g[k][p] ** 2 for k in range(3)) - sum(g[k][q] ** 2 for k in range(3))
+    mixed = 2.0 * sum(g[k][p] * g[k][q] for k in range(3))
+    below = jnp.abs(difference) + jnp.sqrt(difference * difference + mixed * mixed)
+    tangent = jnp.where(below > 0, mixed / jnp.where(below > 0, below, 1.0), 0.0)
+    tangent = jnp.where(difference < 0, -tangent, tangent)
+    cosine = jax.lax.rsqrt(1.0 + tangent * tangent)
+    sine = cosine * tangent
+    for matrix in (g, v):
+        for k in range(3):
+            a, b = matrix[k][p], matrix[k][q]
+            matrix[k][p], matrix[k][q] = cosine * a + sine * b, cosine * b - sine * a
+
+
+def _unit(x: list[Array], otherwise: list[Array]) -> list[Array]:
+    length = jnp.sqrt(_inner(x, x))
+    some = length > 16.0 * jnp.finfo(length.dtype).eps
+    return [jnp.where(some, x[k] / jnp.where(some, length, 1.0), otherwise[k]) for k in range(3)]
+
+
+def _perpendicular(u: list[Array], columns: Grid) -> list[Array]:
+    """A unit vector across u, as close to the second column as can be."""
+    parallel = jnp.abs(_inner(u, columns[1])) > 0.9
+    base = [jnp.where(parallel, columns[2][k], columns[1][k]) for k in range(3)]
+    along = _inner(u, base)
+    rest = [base[k] - along * u[k] for k in range(3)]
+    length = jnp.sqrt(_inner(rest, rest))
+    return [r / length for r in rest]
+
+
+# ---------------------------------------------------------------- 3x3 algebra by components
+
+
+def _grid(matrices: Matrices) -> Grid:
+    return [[matrices[i, j] for j in range(3)] for i in range(3)]
+
+
+def _stack(grid: Grid) -> Matrices:
+    return jnp.stack([jnp.stack(row) for row in grid])
+
+
+def _transpose(x: Grid) -> Grid:
+    return [[x[j][i] for j in range(3)] for i in range(3)]
+
+
+def _product(x: Grid, y: Grid) -> Grid:
+    return [[sum(x[i][k] * y[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+
+
+def _identity(like: Array) -> Grid:
+    one, zero = jnp.ones_like(like), jnp.zeros_like(like)
+    return [[one if i == j else zero for j in range(3)] for i in range(3)]
+
+
+def _where(condition: Array, x: Grid, y: Grid) -> Grid:
+    return [[jnp.where(condition, x[i][j], y[i][j]) for j in range(3)] for i in range(3)]
+
+
+def _minus_identity(x: Grid) -> Grid:
+    return [[x[i][j] - 1.0 if i == j else x[i][j] for j in range(3)] for i in range(3)]
+
+
+def _inner(u: list[Array], v: list[Array]) -> Array:
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+def _cross(u: list[Array], v: list[Array]) -> list[Array]:
+    return [
+        u[1] * v[2] - u[2] * v[1],
+        u[2] * v[0] - u[0] * v[2],
+        u[0] * v[1] - u[1] * v[0],
+    ]

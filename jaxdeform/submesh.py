@@ -1,0 +1,118 @@
+"""Deforming a part: cut out what can move, deform it, put it back (thesis Sec. 4.1.4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import ArrayLike, Float, Int
+
+from jaxdeform.mesh import InputError, Mesh
+from jaxdeform.neighborhood import Cells, rings
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A piece of a mesh around its free vertices; made by :func:`cut`."""
+
+    mesh: Mesh
+    """The piece as a mesh of its own."""
+    cells: Cells
+    """Its cells: those of the whole that contain a free vertex; the others are empty."""
+    handles: Int[np.ndarray, "h"]
+    """Vertices of the piece that are not free (piece's indices)."""
+    index: Int[np.ndarray, "piece"]
+    """The whole's index of each vertex of the piece."""
+    whole: Mesh
+    """The mesh that it was cut from."""
+
+    def restore(
+        self, vertices: ArrayLike, base: ArrayLike | None = None
+    ) -> Float[np.ndarray, "n 3"]:
+        """Return the whole mesh's positions with the piece put back.
+
+        **Arguments**: vertices (piece, 3), the deformed piece; base (n, 3), positions of all other
+        vertices (their rest positions if left out).
+
+        **Raises** InputError for wrong shapes.
+        """
+        piece = np.asarray(vertices)
+        if piece.shape != (len(self.index), 3):
+            raise InputError(f"vertices have shape {piece.shape}: give ({len(self.index)}, 3)")
+        rest = self.whole.vertices if base is None else np.asarray(base)
+        if rest.shape != self.whole.vertices.shape:
+            raise InputError(f"base has shape {rest.shape}: give {self.whole.vertices.shape}")
+        out = np.array(rest, dtype=np.float64)
+        out[self.index] = piece
+        return out
+
+
+def cut(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Part:
+    """Cut out the cells in which something can move, and no more.
+
+    A cell of fixed vertices only has a fixed transformation, so it may be left out: the piece
+    deforms exactly as it would within the whole (to rounding).
+
+    **Arguments**
+
+    - mesh: the whole.
+    - free: indices of the vertices that may move, or a mask (n,).
+    - cells: those of the whole; ``rings(mesh, 1)`` if left out.
+
+    **Raises** InputError: no free vertex, or an index out of range.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> part = jd.cut(mesh, mesh.vertices[:, 1] > 120)
+        >>> problem = jd.precompute(part.mesh, part.handles, cells=part.cells)
+        >>> out = jd.deform(problem, part.mesh.vertices[part.handles], 1.0)
+        >>> part.restore(out.vertices).shape
+        (722, 3)
+    """
+    cells = rings(mesh, 1) if cells is None else cells
+    if cells.n_vertices != mesh.n_vertices:
+        raise InputError("cells are of another mesh: call rings(mesh, r) on this one")
+    is_free = _mask(free, mesh.n_vertices)
+    # The vertices of each cell, its centre included.
+    reach = cells.vertices
+    moving = np.asarray((reach @ is_free.astype(np.int32)) > 0).ravel()
+    kept = np.unique(reach[moving].indices)
+    index = np.union1d(kept, np.flatnonzero(is_free))
+    new = np.full(mesh.n_vertices, -1)
+    new[index] = np.arange(len(index))
+    faces = new[mesh.faces]
+    faces = faces[(faces >= 0).all(axis=1)]
+    if not len(faces):
+        raise InputError("the free vertices belong to no face: nothing can be cut out")
+    piece = Mesh(mesh.vertices[index], faces)
+
+    # The piece's edges among the whole's: both lists are sorted, and so is the renumbering.
+    n = mesh.n_vertices
+    whole_code = cells.edges[:, 0] * n + cells.edges[:, 1]
+    piece_code = index[piece.edges[:, 0]] * n + index[piece.edges[:, 1]]
+    edge = np.searchsorted(whole_code, piece_code)
+    membership = cells.membership.copy()
+    membership.data = membership.data * np.repeat(moving, np.diff(membership.indptr)).astype(
+        np.int8
+    )
+    membership.eliminate_zeros()
+    part_cells = Cells(piece.edges, cells.weights[edge], membership[index][:, edge].tocsr())
+    return Part(piece, part_cells, np.flatnonzero(~is_free[index]), index, mesh)
+
+
+def _mask(free: ArrayLike, n: int) -> np.ndarray:
+    given = np.asarray(free)
+    if given.dtype == bool:
+        if given.shape != (n,):
+            raise InputError(f"the mask of free vertices has shape {given.shape}: give ({n},)")
+        mask = given
+    else:
+        if given.ndim != 1 or given.dtype.kind not in "iu":
+            raise InputError("free must be a list of vertex indices, or a mask of booleans")
+        bad = given[(given < 0) | (given >= n)]
+        if bad.size:
+            raise InputError(f"free vertex {bad[0]} is out of range: vertices are 0 to {n - 1}")
+        mask = np.zeros(n, bool)
+        mask[given] = True
+    if not mask.any():
+        raise InputError("no vertex is free: there is nothing to deform")
+    return mask
