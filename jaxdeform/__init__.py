@@ -14,7 +14,9 @@ from jaxdeform.deformation import (
     material,
     precompute,
 )
+from jaxdeform.handles import HandleFile, load_handles, rigid_targets
 from jaxdeform.laplacian import cotangent_weights
+from jaxdeform.laplacian_editing import LaplacianEditor, laplacian_editing, laplacian_editor
 from jaxdeform.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
 from jaxdeform.mesh import (
     InputError,
@@ -36,9 +38,11 @@ __all__ = [
     "Alternating",
     "Cells",
     "GradientDescent",
+    "HandleFile",
     "Implicit",
     "InputError",
     "Inspection",
+    "LaplacianEditor",
     "Mesh",
     "Newton",
     "Part",
@@ -54,11 +58,15 @@ __all__ = [
     "deform",
     "energy",
     "inspect",
+    "laplacian_editing",
+    "laplacian_editor",
+    "load_handles",
     "load_mesh",
     "load_rigidity",
     "material",
     "precompute",
     "repair",
+    "rigid_targets",
     "rings",
     "rotate",
     "save_mesh",

@@ -14,6 +14,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxdeform.energy import Rows, Scatter, cell_energy, scatter, stiffness
 from jaxdeform.global_step import Anchor, Factor, NotPositiveDefinite, factorise
+from jaxdeform.handles import (
+    as_array,
+    check_components,
+    check_handle_weights,
+    check_handles,
+    check_positions,
+    check_targets,
+    known,
+)
 from jaxdeform.laplacian_editing import LaplacianStart, laplacian_start
 from jaxdeform.local_step import LocalStep, Newton, fit
 from jaxdeform.mesh import InputError, Mesh
@@ -225,12 +234,14 @@ def precompute(
             f"cells are of another mesh ({cells.n_vertices} vertices, {len(cells.edges)} edges; "
             f"this one has {n} and {len(mesh.edges)}): call rings(mesh, r) on this mesh"
         )
-    pull = _check_handle_weights(handle_weights, index)
+    pull = check_handle_weights(handle_weights, index)
     referenced = np.zeros(n, bool)
     referenced[mesh.faces.ravel()] = True
-    _check_components(mesh, index[pull > 0], referenced)
+    check_components(mesh, index[pull > 0], referenced)
 
     kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
+    if kind not in (np.float32, np.float64):
+        raise InputError(f"dtype {kind} is not supported: use float32 or float64")
     if kind == np.float64 and not jax.config.read("jax_enable_x64"):
         raise InputError(
             'dtype float64 needs jax.config.update("jax_enable_x64", True) before anything else'
@@ -285,65 +296,6 @@ def _factorise(cells: Cells, free: np.ndarray, soft: np.ndarray, dtype: np.dtype
         stacklevel=3,
     )
     return cells, matrix, *factored
-
-
-def check_handles(handles: ArrayLike, n: int) -> Int[np.ndarray, "h"]:
-    """Return handle indices as an array, or raise InputError naming what is wrong."""
-    given = np.asarray(handles)
-    if given.ndim != 1:
-        raise InputError(f"handles have shape {given.shape}: give one list of vertex indices")
-    if given.size == 0:
-        raise InputError("no handles: without any the mesh may lie anywhere; give at least one")
-    if given.dtype.kind not in "iu":
-        hint = ": use np.flatnonzero(mask)" if given.dtype == bool else ""
-        raise InputError(f"handles must be integers, got {given.dtype}{hint}")
-    outside = np.flatnonzero((given < 0) | (given >= n))
-    if outside.size:
-        raise InputError(
-            f"handle {given[outside[0]]} (position {outside[0]}) is out of range: the mesh has "
-            f"vertices 0 to {n - 1}"
-        )
-    unique, count = np.unique(given, return_counts=True)
-    if (count > 1).any():
-        raise InputError(
-            f"vertex {unique[count > 1][0]} is a handle {count.max()} times: list it once, since it "
-            "can have one target only"
-        )
-    return given.astype(np.int64)
-
-
-def _check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
-    given = np.asarray(weights, np.float64)
-    if given.ndim and given.shape != index.shape:
-        raise InputError(
-            f"handle_weights have shape {given.shape}: give one number or one per handle, "
-            f"{index.shape}"
-        )
-    given = np.broadcast_to(given, index.shape)
-    bad = np.flatnonzero(~(given >= 0))
-    if bad.size:
-        raise InputError(
-            f"the weight of handle {index[bad[0]]} is {given[bad[0]]}: give 0 or more, np.inf to "
-            "fix it"
-        )
-    return given
-
-
-def _check_components(mesh: Mesh, anchored: np.ndarray, referenced: np.ndarray) -> None:
-    n = mesh.n_vertices
-    i, j = mesh.edges.T
-    graph = sp.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
-    _, label = sp.csgraph.connected_components(graph, directed=False)
-    held = np.zeros(label.max() + 1, bool)
-    held[label[anchored]] = True
-    loose = np.flatnonzero(referenced & ~held[label])
-    if loose.size:
-        k = int(loose[0])
-        size = int((label == label[k]).sum())
-        raise InputError(
-            f"the connected part with vertex {k} ({size} vertices) has no handle, so it could lie "
-            "anywhere: add a handle there, or drop the part"
-        )
 
 
 # ---------------------------------------------------------------- deform
@@ -405,7 +357,7 @@ def deform(
     targets = check_targets(targets, len(problem.handles), dtype)
     rigidity = check_rigidity(rigidity, n, dtype)
     if start is not None:
-        start = _check_positions("start", start, (n, 3), dtype)
+        start = check_positions("start", start, (n, 3), dtype)
     held = _held(problem, targets, rigidity)
     solution = _solve(problem.system, held, start, local, solver, normals, adjoint)
     if not isinstance(solution.vertices, jax.core.Tracer):
@@ -431,8 +383,8 @@ def energy(
         True
     """
     n, dtype, system = problem.n_vertices, problem.dtype, problem.system
-    p = _check_positions("vertices", vertices, (n, 3), dtype).T - system.center[:, None]
-    t = _check_positions("transforms", transforms, (n, 3, 3), dtype)
+    p = check_positions("vertices", vertices, (n, 3), dtype).T - system.center[:, None]
+    t = check_positions("transforms", transforms, (n, 3, 3), dtype)
     lam = check_rigidity(rigidity, n, dtype)
     t = jnp.einsum("kai,ijk->ajk", t, system.frames)
     stiff = system.stiffness.apply(p) - system.soft[None] * p
@@ -462,32 +414,11 @@ def material(problem: Problem, constant: ArrayLike) -> Float[Array, "n"]:
 # ---------------------------------------------------------------- checks of the arguments
 
 
-def known(x) -> bool:
-    """Return whether an array's values can be read now (they cannot while JAX traces)."""
-    return not isinstance(x, jax.core.Tracer)
-
-
-def check_targets(targets: ArrayLike, count: int, dtype: np.dtype) -> Float[Array, "h 3"]:
-    """Return targets as an array (h, 3), or raise InputError naming what is wrong."""
-    return _check_positions("targets", targets, (count, 3), dtype, unit="handle")
-
-
-def _check_positions(name: str, value, shape: tuple, dtype: np.dtype, unit: str = "vertex"):
-    array = _as_array(value, dtype, name)
-    if array.shape != shape:
-        raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
-    if known(array):
-        bad = np.flatnonzero(~np.isfinite(np.asarray(array)).reshape(shape[0], -1).all(axis=1))
-        if bad.size:
-            raise InputError(f"{name} of {unit} {bad[0]} are not finite: give real positions")
-    return array
-
-
 def check_rigidity(
     rigidity: ArrayLike, n: int, dtype: np.dtype, *, name: str = "rigidity"
 ) -> Float[Array, "n"]:
     """Return rigidity as one number per vertex, or raise InputError naming what is wrong."""
-    array = _as_array(rigidity, dtype, name)
+    array = as_array(rigidity, dtype, name)
     if array.shape not in ((), (n,)):
         raise InputError(
             f"{name} has shape {array.shape}: give one number, or one per vertex, ({n},)"
@@ -501,15 +432,6 @@ def check_rigidity(
                 f"{name} is {values[bad[0]]}{where}: it must be a finite number, 0 or more"
             )
     return jnp.broadcast_to(array, (n,))
-
-
-def _as_array(value, dtype: np.dtype, name: str) -> Array:
-    try:
-        return jnp.asarray(value, dtype)
-    except (TypeError, ValueError) as error:
-        if isinstance(value, jax.core.Tracer):
-            raise
-        raise InputError(f"{name} cannot be read as numbers: {error}") from error
 
 
 def _check_settings(solver, adjoint, normals: bool) -> None:
@@ -659,7 +581,7 @@ def _alternate(system: System, held: _Held, p, evaluate, solver: Alternating):
         if solver.tolerance is None:
             done = last
         else:
-            done = last | (gain <= solver.tolerance * jnp.abs(state.energy) + _rounding(state))
+            done = last | _converged(gain, state.energy, _rounding(state), solver.tolerance)
         # A^-1 K^T T, written as a correction of p: it heals its own rounding.
         p = jnp.where(done, p, p - move)
         return p, state.transforms, state.energy, done
@@ -691,8 +613,17 @@ def _alternate(system: System, held: _Held, p, evaluate, solver: Alternating):
 
 
 def _rounding(state: _State) -> Float[Array, ""]:
-    """The gain below which a step is rounding: the energy is a small difference of large sums."""
-    return 2.0 * jnp.finfo(state.scale.dtype).eps * jnp.abs(state.scale)
+    """Below this two energies differ by rounding: they are small differences of large sums."""
+    return 20.0 * jnp.finfo(state.scale.dtype).eps * jnp.abs(state.scale)
+
+
+def _converged(gain, energy, rounding, tolerance: float) -> Bool[Array, ""]:
+    """Whether a plain step is expected to gain less than the tolerance, or than can be computed.
+
+    The gain <g, A^-1 g> is a square, so it is known far more exactly than the energy itself.
+    """
+    eps = jnp.finfo(energy.dtype).eps
+    return gain <= tolerance * jnp.abs(energy) + 1e3 * eps * rounding
 
 
 def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implicit):
@@ -709,8 +640,10 @@ def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implici
         del _residual
         method = _descend if isinstance(solver, QuasiNewton) else _alternate
         fixed_held = jax.lax.stop_gradient(held)
-        p, *rest = method(system, fixed_held, p, evaluate, solver)
-        return jnp.where(system.free[None], p, 0.0), tuple(rest)
+        p, known, history, steps, code = method(system, fixed_held, p, evaluate, solver)
+        # As floats, because custom_root wants tangents of whatever it returns.
+        counts = (steps.astype(p.dtype), code.astype(p.dtype))
+        return jnp.where(system.free[None], p, 0.0), (known, history, *counts)
 
     def precondition(r):
         return jnp.where(system.free[None], system.factor.solve(r), r)
@@ -726,10 +659,11 @@ def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implici
 
         return jax.lax.custom_linear_solve(linear, y, conjugate_gradients, symmetric=True)
 
-    x, rest = jax.lax.custom_root(
+    x, (known, history, steps, code) = jax.lax.custom_root(
         lambda x: residual(x, held), jax.lax.stop_gradient(p), solve, tangent_solve, has_aux=True
     )
-    return jnp.where(system.free[None], x, _fixed(system, held)), *rest
+    p = jnp.where(system.free[None], x, _fixed(system, held))
+    return p, known, history, steps.astype(jnp.int32), code.astype(jnp.int32)
 
 
 class _Memory(NamedTuple):
@@ -774,7 +708,7 @@ def _descend(system: System, held: _Held, p, evaluate, solver: QuasiNewton):
 
     def converged(at: _Point):
         gain = jnp.sum(at.gradient * at.z)
-        return gain <= solver.tolerance * jnp.abs(at.energy) + at.rounding
+        return _converged(gain, at.energy, at.rounding, solver.tolerance)
 
     def unfinished(carry):
         turn, at, _, _, stalled = carry
@@ -834,7 +768,7 @@ def _direction(memory: _Memory, z, sg, zg) -> Float[Array, "3 n"]:
 
 
 def _remember(memory: _Memory, step, old: _Point, new: _Point, sg, zg) -> _Memory:
-    """Put a step into the oldest slot; one along which the curvature is not positive is left out."""
+    """Put a step into the oldest slot, unless the curvature along it is not positive."""
     sg_new, zg_new = _products(memory, new.gradient)
     y, dz = new.gradient - old.gradient, new.z - old.z
     sy, yzy = jnp.sum(step * y), jnp.sum(y * dz)

@@ -32,7 +32,7 @@ WIDEST = 24
 
 
 class Rows(eqx.Module):
-    """A sparse (c, n, n) operator as padded gathers: ``y[c, k] = sum_s coef[c, s, k] x[index[s, k]]``.
+    """A sparse (c, n, n) operator as gathers: ``y[c, k] = sum_s coef[c, s, k] x[index[s, k]]``.
 
     On 51,200 cells with r = 1 this takes 1.0 ms where a CSR product takes 3.2 ms (2 cores,
     float64); BCOO and scatter-adds are slower again by a factor of ten.

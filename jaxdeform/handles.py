@@ -1,0 +1,330 @@
+"""Handles: which vertices are held, where they go, and the files that say so."""
+
+import json
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxdeform.mesh import InputError, Mesh
+
+# ---------------------------------------------------------------- checks of the arguments
+
+
+def check_handles(handles: ArrayLike, n: int) -> Int[np.ndarray, "h"]:
+    """Return handle indices as an array, or raise InputError naming what is wrong."""
+    given = np.asarray(handles)
+    if given.ndim != 1:
+        raise InputError(f"handles have shape {given.shape}: give one list of vertex indices")
+    if given.size == 0:
+        raise InputError("no handles: without any the mesh may lie anywhere; give at least one")
+    if given.dtype.kind not in "iu":
+        hint = ": use np.flatnonzero(mask)" if given.dtype == bool else ""
+        raise InputError(f"handles must be integers, got {given.dtype}{hint}")
+    outside = np.flatnonzero((given < 0) | (given >= n))
+    if outside.size:
+        raise InputError(
+            f"handle {given[outside[0]]} (position {outside[0]}) is out of range: the mesh has "
+            f"vertices 0 to {n - 1}"
+        )
+    unique, count = np.unique(given, return_counts=True)
+    if (count > 1).any():
+        raise InputError(
+            f"vertex {unique[count > 1][0]} is a handle {count.max()} times: list it "
+            "once, since it can have one target only"
+        )
+    return given.astype(np.int64)
+
+
+def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
+    """Return one weight per handle, infinite for a hard one, or raise InputError."""
+    given = np.asarray(weights, np.float64)
+    if given.ndim and given.shape != index.shape:
+        raise InputError(
+            f"handle_weights have shape {given.shape}: give one number or one per handle, "
+            f"{index.shape}"
+        )
+    given = np.broadcast_to(given, index.shape)
+    bad = np.flatnonzero(~(given >= 0))
+    if bad.size:
+        raise InputError(
+            f"the weight of handle {index[bad[0]]} is {given[bad[0]]}: give 0 or more, np.inf to "
+            "fix it"
+        )
+    return given
+
+
+def check_components(mesh: Mesh, anchored: np.ndarray, referenced: np.ndarray) -> None:
+    """Raise InputError where a connected part of the mesh has no handle."""
+    n = mesh.n_vertices
+    i, j = mesh.edges.T
+    graph = sp.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
+    _, label = sp.csgraph.connected_components(graph, directed=False)
+    held = np.zeros(label.max() + 1, bool)
+    held[label[anchored]] = True
+    loose = np.flatnonzero(referenced & ~held[label])
+    if loose.size:
+        k = int(loose[0])
+        size = int((label == label[k]).sum())
+        raise InputError(
+            f"the connected part with vertex {k} ({size} vertices) has no handle, so it could lie "
+            "anywhere: add a handle there, or drop the part"
+        )
+
+
+def known(x) -> bool:
+    """Return whether an array's values can be read now (they cannot while JAX traces)."""
+    return not isinstance(x, jax.core.Tracer)
+
+
+def check_targets(targets: ArrayLike, count: int, dtype: np.dtype) -> Float[Array, "h 3"]:
+    """Return targets as an array (h, 3), or raise InputError naming what is wrong."""
+    return check_positions("targets", targets, (count, 3), dtype, unit="handle")
+
+
+def check_positions(name: str, value, shape: tuple, dtype: np.dtype, unit: str = "vertex"):
+    """Return an array of this shape, finite where its values are known, or raise InputError."""
+    array = as_array(value, dtype, name)
+    if array.shape != shape:
+        raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
+    if known(array):
+        bad = np.flatnonzero(~np.isfinite(np.asarray(array)).reshape(shape[0], -1).all(axis=1))
+        if bad.size:
+            raise InputError(f"{name} of {unit} {bad[0]} are not finite: give real positions")
+    return array
+
+
+def as_array(value, dtype: np.dtype, name: str) -> Array:
+    """Return value as a JAX array, or raise InputError naming the argument."""
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError) as error:
+        if isinstance(value, jax.core.Tracer):
+            raise
+        raise InputError(f"{name} cannot be read as numbers: {error}") from error
+
+
+# ---------------------------------------------------------------- groups that move rigidly
+
+
+def rigid_targets(
+    points: ArrayLike,
+    group: ArrayLike,
+    rotations: ArrayLike,
+    translations: ArrayLike,
+    centers: ArrayLike | None = None,
+) -> Float[Array, "h 3"]:
+    """Return the targets of handle groups, each moved with six degrees of freedom.
+
+    ``target = R_g (p - center_g) + center_g + t_g``; a rotation is a rotation vector (its length is
+    the angle in radians), smooth at zero, so gradients reach rotations and translations.
+
+    **Arguments**
+
+    - points: (h, 3) rest positions of the handles.
+    - group: (h,) the group of each handle, 0 to g - 1.
+    - rotations: (g, 3) rotation vectors; translations: (g, 3).
+    - centers: (g, 3); each group's centroid if left out.
+
+    **Raises** InputError: shapes that do not fit; a group out of range.
+
+    Example:
+        >>> import jaxdeform as jd, numpy as np
+        >>> points = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+        >>> turn = [[0.0, 0.0, np.pi / 2]]
+        >>> jd.rigid_targets(points, [0, 0], turn, [[0.0, 0.0, 5.0]]).round(6).tolist()
+        [[0.0, 1.0, 5.0], [0.0, -1.0, 5.0]]
+    """
+    points = jnp.asarray(points)
+    dtype = points.dtype
+    rotations, translations = jnp.asarray(rotations, dtype), jnp.asarray(translations, dtype)
+    if rotations.ndim != 2 or rotations.shape[1] != 3 or rotations.shape != translations.shape:
+        raise InputError(
+            f"rotations {rotations.shape} and translations {translations.shape}: give (g, 3) each"
+        )
+    count = len(rotations)
+    group = np.asarray(group)
+    if group.shape != (len(points),) or group.dtype.kind not in "iu":
+        raise InputError(f"group has shape {group.shape}: give one integer per handle")
+    if len(group) and not (group.min() >= 0 and group.max() < count):
+        raise InputError(f"group {group.max()} is out of range: there are groups 0 to {count - 1}")
+    if centers is None:
+        size = np.maximum(np.bincount(group, minlength=count), 1)
+        total = jnp.zeros((count, 3), dtype).at[group].add(points)
+        centers = total / jnp.asarray(size, dtype)[:, None]
+    else:
+        centers = jnp.asarray(centers, dtype)
+        if centers.shape != rotations.shape:
+            raise InputError(f"centers have shape {centers.shape}: give {rotations.shape}")
+    moved = jnp.einsum("hij,hj->hi", _rotation(rotations)[group], points - centers[group])
+    return moved + (centers + translations)[group]
+
+
+def _rotation(vector: Float[Array, "g 3"]) -> Float[Array, "g 3 3"]:
+    """Rodrigues' formula, with series at the zero angle so that derivatives exist there."""
+    square = jnp.sum(vector**2, axis=1)
+    small = square < 1e-8
+    safe = jnp.where(small, 1.0, square)
+    angle = jnp.sqrt(safe)
+    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    cosine = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / safe)
+    x, y, z = vector[:, 0], vector[:, 1], vector[:, 2]
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack(
+        [jnp.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], -2
+    )
+    eye = jnp.eye(3, dtype=vector.dtype)[None]
+    return eye + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross)
+
+
+# ---------------------------------------------------------------- files
+
+
+class HandleFile(NamedTuple):
+    """Handles as a file gives them."""
+
+    handles: Int[np.ndarray, "h"]
+    targets: Float[np.ndarray, "h 3"]
+
+
+def load_handles(
+    path: str | os.PathLike, mesh: Mesh, motion: str | os.PathLike | None = None
+) -> HandleFile:
+    """Read handles and their targets from a file.
+
+    Two formats:
+
+    - ``.json``: ``{"handles": [{"vertices": [0, 1], ...}, ...]}``, each group with any of
+      ``"rotation": {"axis": [0, 1, 0], "degrees": 90, "center": [0, 0, 0]}`` (centre: the group's
+      centroid if left out), ``"translation": [1, 0, 0]``, or ``"targets": [[x, y, z], ...]``.
+      A group with none of them stays where it is.
+    - ``.sel`` with ``.def`` (survey of Botsch and Sorkine 2008): a number per vertex, 0 fixed,
+      1 free, 2 handle, and the 4x4 matrix of the handle. The .def beside the .sel is taken.
+
+    **Arguments**: path; mesh, whose rest positions the motions apply to; motion, another .def file.
+
+    **Returns** (handles (h,), targets (h, 3)).
+
+    **Raises** InputError naming the file and the group or line.
+
+    Example:
+        >>> import jaxdeform as jd, json, pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "handles.json"
+        >>> _ = path.write_text(json.dumps({"handles": [{"vertices": [0, 1]}]}))
+        >>> jd.load_handles(path, jd.shapes.bar()).handles
+        array([0, 1])
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}): check the name") from error
+    if path.suffix.lower() == ".json":
+        handles, targets = _parse_json(path, text, mesh)
+    elif path.suffix.lower() == ".sel":
+        handles, targets = _parse_survey(path, text, mesh, motion)
+    else:
+        raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
+    try:
+        handles = check_handles(handles, mesh.n_vertices)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return HandleFile(handles, targets)
+
+
+def _parse_json(path: Path, text: str, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        groups = json.loads(text)["handles"]
+        if not isinstance(groups, list):
+            raise TypeError
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise InputError(
+            f'{path}: is no JSON object with a list "handles" ({type(error).__name__}: {error})'
+        ) from error
+    handles, targets = [], []
+    for number, group in enumerate(groups):
+        where = f"{path}: group {number}"
+        if not isinstance(group, dict) or "vertices" not in group:
+            raise InputError(f'{where} has no "vertices": list the vertex indices')
+        unknown = set(group) - {"vertices", "rotation", "translation", "targets", "name"}
+        if unknown:
+            raise InputError(
+                f"{where} has the unknown key '{sorted(unknown)[0]}': use vertices, rotation, "
+                "translation, targets"
+            )
+        try:
+            index = check_handles(group["vertices"], mesh.n_vertices)
+        except (InputError, ValueError) as error:
+            raise InputError(f"{where}: {error}") from error
+        handles.append(index)
+        targets.append(_moved(where, group, mesh.vertices[index]))
+    if not handles:
+        raise InputError(f"{path}: names no handles: give at least one group")
+    return np.concatenate(handles), np.concatenate(targets)
+
+
+def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
+    if "targets" in group:
+        if "rotation" in group or "translation" in group:
+            raise InputError(f"{where} has targets and a motion: give one of them")
+        return _numbers(where, "targets", group["targets"], points.shape)
+    if "rotation" in group:
+        turn = group["rotation"]
+        if not isinstance(turn, dict) or "degrees" not in turn or "axis" not in turn:
+            raise InputError(f'{where}: rotation needs "axis" and "degrees"')
+        axis = _numbers(where, "axis", turn["axis"], (3,))
+        length = np.linalg.norm(axis)
+        if length == 0:
+            raise InputError(f"{where}: the rotation axis has length zero")
+        degrees = _numbers(where, "degrees", turn["degrees"], ())
+        center = points.mean(axis=0)
+        if "center" in turn:
+            center = _numbers(where, "center", turn["center"], (3,))
+        matrix = np.asarray(_rotation(jnp.asarray(axis / length * np.radians(degrees))[None])[0])
+        points = (points - center) @ matrix.T + center
+    if "translation" in group:
+        points = points + _numbers(where, "translation", group["translation"], (3,))
+    return points
+
+
+def _numbers(where: str, name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: {name} are not numbers") from None
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{where}: {name} must be finite numbers of shape {shape}")
+    return array
+
+
+def _parse_survey(path: Path, text: str, mesh: Mesh, motion) -> tuple[np.ndarray, np.ndarray]:
+    words = [line.split("#")[0].split() for line in text.splitlines()]
+    status = np.array([word for line in words for word in line])
+    if len(status) != mesh.n_vertices:
+        raise InputError(
+            f"{path}: has {len(status)} numbers, the mesh {mesh.n_vertices} vertices: is it of "
+            "another mesh?"
+        )
+    strange = np.flatnonzero(~np.isin(status, ["0", "1", "2"]))
+    if strange.size:
+        raise InputError(
+            f"{path}: vertex {strange[0]} is '{status[strange[0]]}': 0 fixed, 1 free, 2 handle"
+        )
+    beside = Path(motion) if motion is not None else path.with_suffix(".def")
+    try:
+        rows = [line.split("#")[0].split() for line in beside.read_text().splitlines()]
+        matrix = np.array([row for row in rows if row], np.float64)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{beside}: cannot be read as a 4x4 matrix ({error})") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{beside}: holds no 4x4 matrix of finite numbers")
+    handles = np.flatnonzero(status != "1")
+    targets = mesh.vertices[handles].copy()
+    grabbed = status[handles] == "2"
+    targets[grabbed] = targets[grabbed] @ matrix[:3, :3].T + matrix[:3, 3]
+    return handles, targets
