@@ -19,7 +19,7 @@ _FLAT = 1e-13
 
 
 class InputError(ValueError):
-    """Raised for every misuse: names the vertex, face, file or argument, the reason, the next move."""
+    """Raised for every misuse: names vertex, face, file or argument, the reason, the next move."""
 
 
 @dataclass(frozen=True, eq=False)

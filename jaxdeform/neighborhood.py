@@ -133,7 +133,7 @@ def moments(
     membership: sp.csr_matrix,
     vertices: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """Return ``b_k`` (ascending) and proper ``Q_k`` of ``B_k = sum_e w_e e e^T = Q diag(b) Q^T``."""
+    """Return ``b_k`` (ascending), proper ``Q_k`` of ``B_k = sum_e w_e e e^T = Q diag(b) Q^T``."""
     edge = vertices[edges[:, 0]] - vertices[edges[:, 1]]
     outer = weights[:, None, None] * edge[:, :, None] * edge[:, None, :]
     b = (membership.astype(np.float64) @ outer.reshape(-1, 9)).reshape(-1, 3, 3)

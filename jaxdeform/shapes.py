@@ -196,7 +196,7 @@ def _cone(points, a, b, ra, rb):
 
 
 def _collapse_short_edges(points, faces, shortest: float):
-    """Merge vertices closer than ``shortest``: marching cubes leaves slivers where it clips corners.
+    """Merge vertices closer than ``shortest``: marching cubes leaves slivers at clipped corners.
 
     Each vertex takes part in one merge at most, and only where the two share exactly two
     neighbours, which keeps the surface closed and manifold.
@@ -327,8 +327,8 @@ def bend(
     The bend of thesis Fig. 1.1, for the handles at the two ends of a bar: one end stays where it
     is, the other is rotated with respect to the centre of the bar.
 
-    **Arguments**: points (n, 3); degrees; along, the bar's axis; toward, the axis that its upper end
-    bends to. **Raises** InputError: along and toward are the same.
+    **Arguments**: points (n, 3); degrees; along, the bar's axis; toward, the axis that its
+    upper end bends to. **Raises** InputError: along and toward are the same.
 
     Example:
         >>> import jaxdeform as jd

@@ -30,9 +30,9 @@ def real_mesh(name: str) -> jd.Mesh:
     return jd.load_mesh(path)
 
 
-def ends(mesh: jd.Mesh, part: float = 0.04) -> np.ndarray:
-    """Return the vertices at both ends along y."""
-    y = mesh.vertices[:, 1]
+def ends(mesh: jd.Mesh, part: float = 0.04, along: int = 1) -> np.ndarray:
+    """Return the vertices at both ends along an axis, y if left out."""
+    y = mesh.vertices[:, along]
     height = (y - y.min()) / np.ptp(y)
     return np.flatnonzero((height < part) | (height > 1 - part))
 

@@ -22,7 +22,7 @@ def cells(strain, n=200, seed=0, flat=False):
     stretch = np.eye(3) + strain * rng.normal(size=(n, 3, 3))
     c = np.einsum("ni,nij,nkj->nik", b, stretch, r)
     lam = 10 ** rng.uniform(-3, 2, n)
-    return tuple(jnp.asarray(np.moveaxis(x, 0, -1)) for x in (c, b)) + (jnp.asarray(lam),)
+    return jnp.asarray(np.moveaxis(c, 0, -1)), jnp.asarray(b.T), jnp.asarray(lam)
 
 
 def phi(t, c, b, lam):
