@@ -22,6 +22,7 @@ from jaxdeform.mesh import (
     InputError,
     Inspection,
     Mesh,
+    check_output,
     inspect,
     load_mesh,
     load_rigidity,
@@ -29,6 +30,7 @@ from jaxdeform.mesh import (
     save_mesh,
 )
 from jaxdeform.neighborhood import Cells, rings, spokes
+from jaxdeform.pictures import picture
 from jaxdeform.shapes import bend, rotate, translate, twist
 from jaxdeform.submesh import Part, cut
 
@@ -53,6 +55,7 @@ __all__ = [
     "Solution",
     "Unrolled",
     "bend",
+    "check_output",
     "cotangent_weights",
     "cut",
     "deform",
@@ -64,6 +67,7 @@ __all__ = [
     "load_mesh",
     "load_rigidity",
     "material",
+    "picture",
     "precompute",
     "repair",
     "rigid_targets",

@@ -189,6 +189,19 @@ def write_beside(path: Path, write) -> None:
         Path(name).unlink(missing_ok=True)
 
 
+def check_output(path: str | os.PathLike) -> None:
+    """Raise InputError if a mesh could not be written there: suffix or folder are wrong.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.check_output("bent.ply")
+    """
+    path = Path(path)
+    _suffix(path)
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path}: cannot write there: make the folder {path.parent} first")
+
+
 def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "n"]:
     """Read the per-vertex rigidity of a PLY file that :func:`save_mesh` wrote.
 

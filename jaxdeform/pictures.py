@@ -1,0 +1,108 @@
+"""Pictures of meshes, without a display (needs the ``viewer`` extra)."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from jaxdeform.mesh import InputError, Mesh, write_beside
+
+
+def picture(
+    path: str | os.PathLike,
+    mesh: Mesh,
+    poses: Sequence[ArrayLike],
+    *,
+    titles: Sequence[str] = (),
+    values: Sequence[ArrayLike | None] = (),
+    label: str = "rigidity",
+    width: int = 500,
+) -> None:
+    """Draw poses of a mesh side by side, all to one scale, into a PNG file.
+
+    **Arguments**
+
+    - path: a ``.png`` file; replaced whole or not at all.
+    - mesh: gives the faces.
+    - poses: a list of vertices (n, 3).
+    - titles: one text per pose.
+    - values: one array (n,) per pose, or None, shown as colour (logarithmic where positive).
+    - label: what the values are.
+    - width: of each view, in pixels.
+
+    **Raises** InputError: no PNG name, or pyvista is not installed.
+
+    Example:
+        >>> import jaxdeform as jd, pathlib, tempfile
+        >>> mesh = jd.shapes.square()
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "square.png"
+        >>> jd.picture(path, mesh, [mesh.vertices])
+        >>> path.stat().st_size > 1000
+        True
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: pictures are PNG files: use a .png name")
+    try:
+        import pyvista
+    except ImportError:
+        raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'") from None
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    # Without a display VTK falls back to drawing in memory, which is all we want: no warning.
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    arrays = [np.asarray(pose, np.float64) for pose in poses]
+    shown = [v for v in values if v is not None]
+    limits = (min(map(np.min, shown)), max(map(np.max, shown))) if shown else (0.0, 1.0)
+    logarithmic = limits[0] > 0 and limits[1] > 5 * limits[0]
+    plotter = pyvista.Plotter(
+        shape=(1, len(arrays)), window_size=[width * len(arrays), int(1.3 * width)], off_screen=True
+    )
+    for k, pose in enumerate(arrays):
+        plotter.subplot(0, k)
+        surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
+        color = values[k] if k < len(values) else None
+        options = {"color": "lightsteelblue"}
+        if color is not None:
+            options = {
+                "scalars": np.broadcast_to(np.asarray(color, np.float64), len(pose)),
+                "clim": limits if limits[1] > limits[0] else (limits[0], limits[0] + 1),
+                "log_scale": bool(logarithmic),
+                "cmap": "viridis",
+                "scalar_bar_args": {"title": label},
+            }
+        plotter.add_mesh(surface, show_edges=mesh.n_faces < 5000, line_width=0.5, **options)
+        if k < len(titles):
+            plotter.add_text(titles[k], font_size=10)
+    # Seen against the direction in which all poses together are thinnest.
+    together = np.concatenate(arrays)
+    plotter.link_views()
+    plotter.camera_position = _camera(together)
+    plotter.reset_camera(bounds=_bounds(together))
+    image = plotter.screenshot(return_img=True)
+    plotter.close()
+
+    def write(name: str) -> None:
+        from PIL import Image  # comes with pyvista
+
+        Image.fromarray(image).save(name, format="PNG")
+
+    write_beside(path, write)
+
+
+def _camera(points: Float[np.ndarray, "n 3"]):
+    extent = np.ptp(points, axis=0)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    thin, up = int(np.argmin(extent)), int(np.argmax(extent))
+    if extent[1] > 0.8 * extent[up] and thin != 1:
+        up = 1  # most meshes stand along y
+    direction = np.full(3, 0.35)
+    direction[thin], direction[up] = 1.0, 0.25
+    return [middle + 3 * np.linalg.norm(extent) * direction, middle, np.eye(3)[up]]
+
+
+def _bounds(points: Float[np.ndarray, "n 3"]) -> list[float]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return [value for pair in zip(low, high, strict=True) for value in pair]
