@@ -1,6 +1,7 @@
 """Laplacian mesh editing: the baseline of Eq. 3.2 and the engine's first guess (Sec. 4.1.2)."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -13,6 +14,7 @@ from jaxdeform.handles import (
     check_handle_weights,
     check_handles,
     check_targets,
+    known,
 )
 from jaxdeform.laplacian import graph_laplacian
 from jaxdeform.mesh import InputError, Mesh
@@ -78,8 +80,11 @@ class LaplacianEditor(eqx.Module):
         x = held.T.reshape(self.pull.shape)
         fixed = jnp.where(self.free[None], 0.0, x)
         right = self.pull + self.soft[None] * x - self.normal.apply(fixed)
-        out = fixed + self.factor.solve(jnp.where(self.free[None], right, 0.0))
-        return out.reshape(3, -1).T
+        out = (fixed + self.factor.solve(jnp.where(self.free[None], right, 0.0))).reshape(3, -1).T
+        if known(out):
+            # The host's factor lives as long as the editor; do not outrun it.
+            jax.block_until_ready(out)
+        return out
 
 
 def laplacian_editor(
