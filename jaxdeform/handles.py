@@ -137,42 +137,61 @@ def rigid_targets(
         >>> import jaxdeform as jd, numpy as np
         >>> points = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
         >>> turn = [[0.0, 0.0, np.pi / 2]]
-        >>> jd.rigid_targets(points, [0, 0], turn, [[0.0, 0.0, 5.0]]).round(6).tolist()
-        [[0.0, 1.0, 5.0], [0.0, -1.0, 5.0]]
+        >>> moved = jd.rigid_targets(points, [0, 0], turn, [[0.0, 0.0, 5.0]])
+        >>> np.allclose(moved, [[0.0, 1.0, 5.0], [0.0, -1.0, 5.0]], atol=1e-6)
+        True
     """
     points = jnp.asarray(points)
-    dtype = points.dtype
-    rotations, translations = jnp.asarray(rotations, dtype), jnp.asarray(translations, dtype)
-    if rotations.ndim != 2 or rotations.shape[1] != 3 or rotations.shape != translations.shape:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points have shape {points.shape}: give (h, 3)")
+    # Whole numbers are positions too, but rotations are not to be cut down to them.
+    dtype = points.dtype if points.dtype.kind == "f" else jnp.result_type(float)
+    points = check_positions("points", points, points.shape, dtype, unit="handle")
+    rotations = as_array(rotations, dtype, "rotations")
+    if rotations.ndim != 2 or rotations.shape[1] != 3:
+        raise InputError(f"rotations have shape {rotations.shape}: give (g, 3) rotation vectors")
+    shape = rotations.shape
+    rotations = check_positions("rotations", rotations, shape, dtype, unit="group")
+    translations = check_positions("translations", translations, shape, dtype, unit="group")
+    group = check_groups(group, len(points))
+    if len(group) and group.max() >= len(rotations):
         raise InputError(
-            f"rotations {rotations.shape} and translations {translations.shape}: give (g, 3) each"
+            f"group {group.max()} is out of range: there are rotations for groups 0 to "
+            f"{len(rotations) - 1}"
         )
-    count = len(rotations)
-    group = np.asarray(group)
-    if group.shape != (len(points),) or group.dtype.kind not in "iu":
-        raise InputError(f"group has shape {group.shape}: give one integer per handle")
-    if len(group) and not (group.min() >= 0 and group.max() < count):
-        raise InputError(f"group {group.max()} is out of range: there are groups 0 to {count - 1}")
     if centers is None:
-        size = np.maximum(np.bincount(group, minlength=count), 1)
-        total = jnp.zeros((count, 3), dtype).at[group].add(points)
+        size = np.maximum(np.bincount(group, minlength=len(rotations)), 1)
+        total = jnp.zeros(shape, dtype).at[group].add(points)
         centers = total / jnp.asarray(size, dtype)[:, None]
     else:
-        centers = jnp.asarray(centers, dtype)
-        if centers.shape != rotations.shape:
-            raise InputError(f"centers have shape {centers.shape}: give {rotations.shape}")
-    moved = jnp.einsum("hij,hj->hi", _rotation(rotations)[group], points - centers[group])
+        centers = check_positions("centers", centers, shape, dtype, unit="group")
+    moved = jnp.einsum("hij,hj->hi", rotation_matrices(rotations)[group], points - centers[group])
     return moved + (centers + translations)[group]
 
 
-def _rotation(vector: Float[Array, "g 3"]) -> Float[Array, "g 3 3"]:
+def check_groups(group: ArrayLike, count: int) -> Int[np.ndarray, "h"]:
+    """Return one group number >= 0 per handle, or raise InputError naming what is wrong."""
+    given = np.asarray(group)
+    if given.shape != (count,) or given.dtype.kind not in "iu":
+        raise InputError(
+            f"group has shape {given.shape} and type {given.dtype}: give one integer per handle, "
+            f"({count},)"
+        )
+    bad = np.flatnonzero(given < 0)
+    if bad.size:
+        raise InputError(f"the group of handle {bad[0]} is {given[bad[0]]}: number them from 0")
+    return given.astype(np.int64)
+
+
+def rotation_matrices(vector: Float[Array, "g 3"]) -> Float[Array, "g 3 3"]:
     """Rodrigues' formula, with series at the zero angle so that derivatives exist there."""
     square = jnp.sum(vector**2, axis=1)
     small = square < 1e-8
     safe = jnp.where(small, 1.0, square)
     angle = jnp.sqrt(safe)
     sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
-    cosine = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / safe)
+    # 1 - cos by the half angle, which loses no digits.
+    cosine = jnp.where(small, 0.5 - square / 24.0, 2.0 * jnp.sin(angle / 2.0) ** 2 / safe)
     x, y, z = vector[:, 0], vector[:, 1], vector[:, 2]
     zero = jnp.zeros_like(x)
     cross = jnp.stack(
@@ -285,7 +304,9 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
         center = points.mean(axis=0)
         if "center" in turn:
             center = _numbers(where, "center", turn["center"], (3,))
-        matrix = np.asarray(_rotation(jnp.asarray(axis / length * np.radians(degrees))[None])[0])
+        matrix = np.asarray(
+            rotation_matrices(jnp.asarray(axis / length * np.radians(degrees))[None])[0]
+        )
         points = (points - center) @ matrix.T + center
     if "translation" in group:
         points = points + _numbers(where, "translation", group["translation"], (3,))
