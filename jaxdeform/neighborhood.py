@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from jaxdeform.laplacian import cotangent_weights
 from jaxdeform.mesh import InputError, Mesh
@@ -27,7 +28,7 @@ class Cells:
     @property
     def n_vertices(self) -> int:
         """Number of cells, which is the number of vertices."""
-        return self.membership.shape[0]
+        return len(self.membership.indptr) - 1
 
     @property
     def overlap(self) -> Int[np.ndarray, "edges"]:
@@ -41,7 +42,7 @@ class Cells:
         rows = np.repeat(np.arange(count), 2)
         ends = sp.csr_matrix((np.ones(2 * count, np.int32), (rows, self.edges.ravel())), (count, n))
         inside = self.membership.astype(np.int32) @ ends
-        return (inside + sp.identity(n, dtype=np.int32, format="csr")).tocsr()
+        return sp.csr_matrix(inside + sp.eye_array(n).astype(np.int32))
 
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
@@ -62,7 +63,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     - weights: one finite weight per row of ``mesh.edges``, used as they are. If left out: cotangent
       weights, of which the negative ones (obtuse angles) are kept, except in cells whose moments
       ``B_k = sum w e e^T`` they make indefinite. There they are set to 0, since such a cell would
-      gain energy from stretching. Few meshes have such cells; ``jd.inspect`` counts them.
+      gain energy from stretching. Few meshes have such cells.
 
     **Raises** InputError: r below 1, not an integer, or of the wrong length; weights likewise.
 
@@ -87,7 +88,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
         )
 
     incidence = _incidence(mesh)
-    step = ((incidence @ incidence.T) + sp.identity(n, dtype=np.int8, format="csr")).tocsr()
+    step = sp.csr_matrix(incidence @ incidence.T + sp.eye_array(n).astype(np.int8))
     step.data[:] = 1
     reach = step.copy()
     for ring in range(2, int(radius.max()) + 1):

@@ -3,9 +3,11 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxdeform.mesh import InputError, Mesh, write_beside
 
@@ -64,7 +66,7 @@ def picture(
         plotter.subplot(0, k)
         surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
         color = values[k] if k < len(values) else None
-        options = {"color": "lightsteelblue"}
+        options: dict[str, Any] = {"color": "lightsteelblue"}
         if color is not None:
             options = {
                 "scalars": np.broadcast_to(np.asarray(color, np.float64), len(pose)),
@@ -80,8 +82,9 @@ def picture(
     together = np.concatenate(arrays)
     plotter.link_views()
     plotter.camera_position = _camera(together)
-    plotter.reset_camera(bounds=_bounds(together))
-    image = plotter.screenshot(return_img=True)
+    # pyvista's decorator hides self from pyright.
+    plotter.reset_camera(bounds=_bounds(together))  # pyright: ignore[reportCallIssue]
+    image = np.asarray(plotter.screenshot(return_img=True))
     plotter.close()
 
     def write(name: str) -> None:
