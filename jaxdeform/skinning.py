@@ -304,11 +304,16 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "n m
 
 
 def _check_cage(points: Float[np.ndarray, "n 3"], cage: Mesh) -> None:
-    pairs = np.sort(cage.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, times = np.unique(pairs, axis=0, return_counts=True)
-    if (times % 2).any():
-        i, j = edges[times % 2 == 1][0]
-        raise InputError(f"the cage is open at its edge ({i}, {j}): give a closed mesh")
+    # Each edge of a closed surface is run along as often in one direction as in the other.
+    sides = cage.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges, place = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    balance = np.bincount(place.ravel(), np.where(sides[:, 0] < sides[:, 1], 1, -1))
+    if balance.any():
+        i, j = edges[np.flatnonzero(balance)[0]]
+        raise InputError(
+            f"the cage is open, or its faces are turned against each other, at the edge ({i}, "
+            f"{j}): give a closed mesh"
+        )
     faces = np.ascontiguousarray(cage.faces)
     inside = np.abs(igl.winding_number(cage.vertices, faces, points)) > 0.5
     # On the cage itself the winding number is 1/2 give or take.
@@ -346,7 +351,7 @@ def _mean_values(points, corners, faces) -> Float[np.ndarray, "n m"]:
     shares = np.einsum("pfix,pfx->pfi", normal, mean) / np.where(flat, np.inf, height)
     shares /= np.where(on_corner, 1.0, length)[:, faces]
     # On a face its barycentric coordinates are the limit; a corner takes all.
-    on_face = (theta.sum(axis=2) > 2.0 * np.pi - 1e-9) & ~on_corner.any(axis=1, keepdims=True)
+    on_face = flat[:, :, 0] & (theta.sum(axis=2) > 2.0 * np.pi - 1e-9)
     reach = length[:, faces]
     area = sine * np.roll(reach, -1, axis=2) * np.roll(reach, -2, axis=2)
     shares = np.where(on_face.any(axis=1)[:, None, None], on_face[:, :, None] * area, shares)
