@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, ArrayLike, Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxdeform.mesh import InputError, Mesh
 
@@ -239,16 +240,16 @@ def load_handles(
         array([0, 1])
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}): check the name") from error
-    if path.suffix.lower() == ".json":
-        handles, targets = _parse_json(path, text, mesh)
-    elif path.suffix.lower() == ".sel":
-        handles, targets = _parse_survey(path, text, mesh, motion)
-    else:
+    suffix = path.suffix.lower()
+    if suffix == ".sel":
+        beside = path.with_suffix(".def") if motion is None else Path(motion)
+        handles, targets = _parse_survey(path, beside, mesh)
+    elif suffix != ".json":
         raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
+    elif motion is not None:
+        raise InputError(f"{path}: a .json file holds its motions itself: leave out {motion}")
+    else:
+        handles, targets = _parse_json(path, mesh)
     try:
         handles = check_handles(handles, mesh.n_vertices)
     except InputError as error:
@@ -256,35 +257,42 @@ def load_handles(
     return HandleFile(handles, targets)
 
 
-def _parse_json(path: Path, text: str, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def _read_text(path: Path) -> str:
     try:
-        groups = json.loads(text)["handles"]
-        if not isinstance(groups, list):
-            raise TypeError
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise InputError(
-            f'{path}: is no JSON object with a list "handles" ({type(error).__name__}: {error})'
-        ) from error
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): check the name") from error
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is no text file: is it another kind of file?") from None
+
+
+def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        content = json.loads(_read_text(path))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({error}): mend it there") from error
+    groups = content.get("handles") if isinstance(content, dict) else None
+    if not isinstance(groups, list) or not groups:
+        raise InputError(f'{path}: give {{"handles": [group, ...]}}, with one group at least')
     handles, targets = [], []
     for number, group in enumerate(groups):
         where = f"{path}: group {number}"
         if not isinstance(group, dict) or "vertices" not in group:
             raise InputError(f'{where} has no "vertices": list the vertex indices')
-        unknown = set(group) - {"vertices", "rotation", "translation", "targets", "name"}
-        if unknown:
-            raise InputError(
-                f"{where} has the unknown key '{sorted(unknown)[0]}': use vertices, rotation, "
-                "translation, targets"
-            )
+        _check_keys(where, group, "vertices", "rotation", "translation", "targets", "name")
         try:
             index = check_handles(group["vertices"], mesh.n_vertices)
         except (InputError, ValueError) as error:
             raise InputError(f"{where}: {error}") from error
         handles.append(index)
         targets.append(_moved(where, group, mesh.vertices[index]))
-    if not handles:
-        raise InputError(f"{path}: names no handles: give at least one group")
     return np.concatenate(handles), np.concatenate(targets)
+
+
+def _check_keys(where: str, given: dict, *known: str) -> None:
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise InputError(f"{where} has the unknown key '{unknown[0]}': use {', '.join(known)}")
 
 
 def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
@@ -296,18 +304,18 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
         turn = group["rotation"]
         if not isinstance(turn, dict) or "degrees" not in turn or "axis" not in turn:
             raise InputError(f'{where}: rotation needs "axis" and "degrees"')
+        _check_keys(f"{where}: rotation", turn, "axis", "degrees", "center")
         axis = _numbers(where, "axis", turn["axis"], (3,))
         length = np.linalg.norm(axis)
         if length == 0:
-            raise InputError(f"{where}: the rotation axis has length zero")
+            raise InputError(f"{where}: the rotation axis has length zero: give a direction")
         degrees = _numbers(where, "degrees", turn["degrees"], ())
         center = points.mean(axis=0)
         if "center" in turn:
             center = _numbers(where, "center", turn["center"], (3,))
-        matrix = np.asarray(
-            rotation_matrices(jnp.asarray(axis / length * np.radians(degrees))[None])[0]
-        )
-        points = (points - center) @ matrix.T + center
+        # scipy's rotation is double precision, whatever JAX is set to.
+        rotation = Rotation.from_rotvec(axis / length * np.radians(degrees))
+        points = rotation.apply(points - center) + center
     if "translation" in group:
         points = points + _numbers(where, "translation", group["translation"], (3,))
     return points
@@ -317,15 +325,15 @@ def _numbers(where: str, name: str, value, shape: tuple[int, ...]) -> np.ndarray
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: {name} are not numbers") from None
+        raise InputError(f"{where}: {name}: give numbers") from None
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{where}: {name} must be finite numbers of shape {shape}")
+        size = f"{' x '.join(map(str, shape))} finite numbers" if shape else "one finite number"
+        raise InputError(f"{where}: {name}: give {size}")
     return array
 
 
-def _parse_survey(path: Path, text: str, mesh: Mesh, motion) -> tuple[np.ndarray, np.ndarray]:
-    words = [line.split("#")[0].split() for line in text.splitlines()]
-    status = np.array([word for line in words for word in line])
+def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    status = np.array([word for row in _words(path) for word in row])
     if len(status) != mesh.n_vertices:
         raise InputError(
             f"{path}: has {len(status)} numbers, the mesh {mesh.n_vertices} vertices: is it of "
@@ -336,16 +344,20 @@ def _parse_survey(path: Path, text: str, mesh: Mesh, motion) -> tuple[np.ndarray
         raise InputError(
             f"{path}: vertex {strange[0]} is '{status[strange[0]]}': 0 fixed, 1 free, 2 handle"
         )
-    beside = Path(motion) if motion is not None else path.with_suffix(".def")
-    try:
-        rows = [line.split("#")[0].split() for line in beside.read_text().splitlines()]
-        matrix = np.array([row for row in rows if row], np.float64)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{beside}: cannot be read as a 4x4 matrix ({error})") from error
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(f"{beside}: holds no 4x4 matrix of finite numbers")
+    matrix = _numbers(str(motion), "the matrix", _words(motion), (4, 4))
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{motion}: the matrix ends in the row {matrix[3].tolist()}: give 0 0 0 1 there, and "
+            "the translation in the last column"
+        )
     handles = np.flatnonzero(status != "1")
     targets = mesh.vertices[handles].copy()
     grabbed = status[handles] == "2"
     targets[grabbed] = targets[grabbed] @ matrix[:3, :3].T + matrix[:3, 3]
     return handles, targets
+
+
+def _words(path: Path) -> list[list[str]]:
+    """Return the words of each line, without comments and empty lines."""
+    rows = [line.split("#")[0].split() for line in _read_text(path).splitlines()]
+    return [row for row in rows if row]

@@ -88,22 +88,19 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
         )
 
     incidence = _incidence(mesh)
-    step = sp.csr_matrix(incidence @ incidence.T + sp.eye_array(n).astype(np.int8))
-    step.data[:] = 1
-    reach = step.copy()
+    # As booleans: counts of paths would overflow (256 of them are 0 in eight bits).
+    ends_at = incidence.astype(bool)
+    step = sp.csr_matrix(ends_at @ ends_at.T + sp.eye_array(n).astype(bool))
+    reach = step
     for ring in range(2, int(radius.max()) + 1):
-        # A row that has its r already is multiplied by the identity.
-        grow = np.flatnonzero(radius >= ring)
-        keep = sp.diags((radius < ring).astype(np.int8), format="csr", dtype=np.int8)
-        select = sp.csr_matrix(
-            (np.ones(len(grow), np.int8), (grow, np.arange(len(grow)))), shape=(n, len(grow))
-        )
-        grown = reach[grow] @ step
-        grown.data[:] = 1
-        reach = (keep @ reach + select @ grown).tocsr()
-        reach.eliminate_zeros()
-    ends = (reach @ incidence).tocsr()
+        growing = sp.csr_matrix(sp.diags_array(radius >= ring, dtype=bool) @ reach)
+        growing.eliminate_zeros()
+        wider = sp.csr_matrix(reach + growing @ step)
+        if wider.nnz == reach.nnz:
+            break  # every cell is all of its part already
+        reach = wider
     # Of an edge's two ends, a cell reaches none, one or both: both make it a member.
+    ends = sp.csr_matrix(reach.astype(np.int8) @ incidence)
     ends.data = (ends.data == 2).astype(np.int8)
     ends.eliminate_zeros()
     ends.sort_indices()

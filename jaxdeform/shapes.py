@@ -113,8 +113,8 @@ def octopus(vertices: int = 50_000) -> Mesh:
         >>> jd.shapes.octopus(10_000).n_vertices // 1000
         10
     """
-    if vertices < 5_000:
-        raise InputError(f"octopus of {vertices} vertices: give 5000 or more")
+    if isinstance(vertices, str) or vertices != int(vertices) or vertices < 5_000:
+        raise InputError(f"octopus of {vertices} vertices: give a whole number, 5000 or more")
     limbs = [([[0, 0.4, 0], [0, 1.3, 0.1]], [0.72, 0.85])]
     for k in range(8):
         turn = 2 * np.pi * (k + 0.5) / 8
@@ -271,13 +271,16 @@ def _distance(points, cones, blend: float):
 def translate(points: ArrayLike, offset: ArrayLike) -> Float[Array, "n 3"]:
     """Return the points moved by an offset (3,), or by one offset each (n, 3).
 
+    **Raises** InputError: another shape.
+
     Example:
         >>> import jaxdeform as jd
         >>> jd.translate([[0.0, 0.0, 0.0]], [1.0, 2.0, 3.0]).tolist()
         [[1.0, 2.0, 3.0]]
     """
     points = _points(points)
-    return points + jnp.broadcast_to(jnp.asarray(offset, points.dtype), points.shape)
+    offset = _array("offset", offset, points.dtype, (3,), points.shape)
+    return points + jnp.broadcast_to(offset, points.shape)
 
 
 def rotate(
@@ -290,7 +293,7 @@ def rotate(
     """Return the points turned about an axis through a centre (their centroid if left out).
 
     **Arguments**: points (n, 3); degrees, counter-clockwise seen against the axis; axis, 'x', 'y',
-    'z' or a vector (3,); center (3,). **Raises** InputError: an axis of length zero.
+    'z' or a vector (3,); center (3,). **Raises** InputError: an axis of length zero, wrong shapes.
 
     Example:
         >>> import jaxdeform as jd
@@ -298,7 +301,8 @@ def rotate(
         [[0.0, 1.0, 0.0]]
     """
     points = _points(points)
-    middle = points.mean(axis=0) if center is None else jnp.asarray(center, points.dtype)
+    center = points.mean(axis=0) if center is None else center
+    middle = _array("center", center, points.dtype, (3,))
     return _turn(points, degrees, _axis(axis), middle)
 
 
@@ -348,9 +352,19 @@ def bend(
 
 def _points(points: ArrayLike) -> Float[Array, "n 3"]:
     array = points if isinstance(points, jax.Array) else np.asarray(points)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"points have shape {array.shape}: give (n, 3)")
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise InputError(f"points have shape {array.shape}: give (n, 3) with n >= 1")
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"points are of type {array.dtype}: give numbers")
     return jnp.asarray(array, None if array.dtype.kind == "f" else float)
+
+
+def _array(name: str, value: ArrayLike, dtype, *shapes: tuple[int, ...]) -> Array:
+    array = jnp.asarray(value, dtype)
+    if array.shape not in shapes:
+        allowed = " or ".join(map(str, shapes))
+        raise InputError(f"{name} has shape {array.shape}: give {allowed}")
+    return array
 
 
 def _axis(axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
@@ -371,7 +385,7 @@ def _upper(points: Float[Array, "n 3"], along: str):
 
 def _turn(points, degrees, axis: np.ndarray, center) -> Float[Array, "n 3"]:
     """Rodrigues' formula."""
-    angle = jnp.deg2rad(jnp.asarray(degrees, points.dtype))
+    angle = jnp.deg2rad(_array("degrees", degrees, points.dtype, ()))
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     turn = (
         jnp.eye(3, dtype=points.dtype)
