@@ -14,6 +14,15 @@ from jaxdeform.deformation import (
     material,
     precompute,
 )
+from jaxdeform.estimation import (
+    Estimate,
+    RigidGroup,
+    ThesisEstimate,
+    estimate_rigidity,
+    estimate_rigidity_thesis,
+    find_handle_groups,
+    find_handles,
+)
 from jaxdeform.handles import HandleFile, load_handles, rigid_targets
 from jaxdeform.laplacian import cotangent_weights
 from jaxdeform.laplacian_editing import LaplacianEditor, laplacian_editing, laplacian_editor
@@ -51,6 +60,7 @@ __all__ = [
     "AffineFit",
     "Alternating",
     "Cells",
+    "Estimate",
     "GradientDescent",
     "HandleFile",
     "Implicit",
@@ -63,9 +73,11 @@ __all__ = [
     "Problem",
     "QuasiNewton",
     "Result",
+    "RigidGroup",
     "RotationFit",
     "Skeleton",
     "Solution",
+    "ThesisEstimate",
     "Unrolled",
     "bend",
     "bounded_biharmonic_weights",
@@ -75,6 +87,10 @@ __all__ = [
     "deform",
     "dual_quaternion_skinning",
     "energy",
+    "estimate_rigidity",
+    "estimate_rigidity_thesis",
+    "find_handle_groups",
+    "find_handles",
     "geodesic_distances",
     "inspect",
     "inverse_distance_weights",
