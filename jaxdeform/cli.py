@@ -1,21 +1,29 @@
 """The command line: ``jaxdeform demo | inspect | deform``."""
 
+import os
+import signal
 import sys
+import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import jax
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 # Files are read and written in double precision, so the command line computes in it.
 jax.config.update("jax_enable_x64", True)
 
 import jaxdeform as jd  # noqa: E402 (after x64)
+from jaxdeform.deformation import check_rigidity  # noqa: E402
+from jaxdeform.pictures import check_picture  # noqa: E402
 
 app = typer.Typer(
     help="Deform triangle meshes whose parts differ in rigidity.",
@@ -23,23 +31,53 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console(stderr=False, highlight=False)
+# File names are printed as they are: no markup in brackets, no line breaks.
+console = Console(highlight=False, markup=False, soft_wrap=True)
 
-# Steps between two moves of the progress bar: T is a function of the positions alone, so an
-# iteration may be cut anywhere and gone on with.
-_CHUNK = 10
+Out = TypeVar("Out")
+
+
+class _Interrupted(BaseException):
+    """Ctrl-C. (Typer would take a KeyboardInterrupt for itself.)"""
+
+
+def _interrupt(*_) -> None:
+    raise _Interrupted
 
 
 def main() -> None:
     """Run the command line; an InputError is one line on standard error, and exit code 2."""
+    before = signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
     except jd.InputError as error:
         print(f"jaxdeform: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except _Interrupted:
         print("jaxdeform: interrupted; files that were there are whole", file=sys.stderr)
-        sys.exit(130)
+        sys.stderr.flush()
+        os._exit(130)  # whatever is still computing beside
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _patiently(what: str, work: Callable[[], Out]) -> Out:
+    """Run work in another thread, showing how long: while JAX computes, no one hears Ctrl-C."""
+    outcome: Future[Out] = Future()
+
+    def run() -> None:
+        try:
+            outcome.set_result(work())
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    columns = SpinnerColumn(), TextColumn(what, markup=False), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        bar.add_task(what, total=None)
+        threading.Thread(target=run, daemon=True).start()
+        return outcome.result()
 
 
 @app.command()
@@ -48,6 +86,7 @@ def demo(
 ) -> None:
     """Bend a bar of two materials and write the deformed meshes and a picture."""
     _make_folder(out)
+    check_picture(out / "demo.png")
     mesh = jd.shapes.bar()
     y = mesh.vertices[:, 1]
     handles = np.flatnonzero((y < 6) | (y > 145))
@@ -64,8 +103,8 @@ def demo(
     poses = []
     for name, rigidity in materials.items():
         began = time.perf_counter()
-        with console.status(f"bending the {name} bar"):
-            solution = jd.deform(problem, targets, rigidity)
+        bend = partial(jd.deform, problem, targets, rigidity)
+        solution = _patiently(f"bending the {name} bar", bend)
         table.add_row(
             name,
             f"{float(solution.energy[-1]):.4g}",
@@ -100,9 +139,13 @@ def deform(
     rigidity: Annotated[
         str, typer.Option(help="A number, or a PLY file with a rigidity per vertex.")
     ],
-    rings: Annotated[int, typer.Option(help="Size of the neighbourhoods.")] = 1,
+    rings: Annotated[int, typer.Option(min=1, help="Size of the neighbourhoods.")] = 1,
     steps: Annotated[
-        int | None, typer.Option(help="This many alternating steps; to convergence if left out.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="This many alternating steps; to convergence if left out (100 with --normals).",
+        ),
     ] = None,
     normals: Annotated[bool, typer.Option(help="Add the normal term (Eq. 4.7).")] = False,
     motion: Annotated[Path | None, typer.Option(help=".def file of a .sel handle file.")] = None,
@@ -112,57 +155,48 @@ def deform(
     shape = jd.load_mesh(mesh)
     # Whatever can be wrong is found before the long work.
     jd.check_output(out)
+    if picture is not None:
+        check_picture(picture)
     held = jd.load_handles(handles, shape, motion)
-    values = _rigidity(rigidity)
+    values = _rigidity(rigidity, shape)
     began = time.perf_counter()
-    with console.status("precomputing"):
-        problem = jd.precompute(shape, held.handles, cells=jd.rings(shape, rings))
+    problem = _patiently(
+        "precomputing", lambda: jd.precompute(shape, held.handles, cells=jd.rings(shape, rings))
+    )
     console.print(f"{shape}, {len(held.handles)} handles: precomputed in {_since(began)}")
     began = time.perf_counter()
-    if normals and steps is None:
-        steps = 100
-    if steps is None:
-        with console.status("deforming"):
-            solution = jd.deform(problem, held.targets, values)
-    else:
-        solution = _alternate(problem, held.targets, values, steps, normals)
-    done = int(solution.steps) if steps is None else steps
-    console.print(f"energy {float(solution.energy[-1]):.6g} after {done} steps in {_since(began)}")
+    solver = None if steps is None else jd.Alternating(steps)
+    solution = _patiently(
+        "deforming",
+        lambda: jd.deform(problem, held.targets, values, solver=solver, normals=normals),
+    )
+    energy, done = float(solution.energy[-1]), int(solution.steps)
+    console.print(f"energy {energy:.6g} after {done} steps in {_since(began)}")
     console.print(str(solution.result))
     color = values if out.suffix.lower() == ".ply" else None
     jd.save_mesh(out, shape, vertices=np.asarray(solution.vertices), rigidity=color)
     console.print(f"wrote {out}")
     if picture is not None:
         poses = [shape.vertices, np.asarray(solution.vertices)]
-        jd.picture(picture, shape, poses, titles=["rest", "deformed"])
+        colors = [None, values] if values.ndim else []
+        jd.picture(picture, shape, poses, titles=["rest", "deformed"], values=colors)
         console.print(f"wrote {picture}")
 
 
-def _alternate(problem, targets, rigidity, steps: int, normals: bool) -> jd.Solution:
-    if steps < 1:
-        raise jd.InputError(f"--steps {steps}: give 1 or more")
-    start, solution = None, None
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("deforming", total=steps)
-        for done in range(0, steps, _CHUNK):
-            chunk = jd.Alternating(steps=min(_CHUNK, steps - done))
-            solution = jd.deform(
-                problem, targets, rigidity, solver=chunk, start=start, normals=normals
-            )
-            start = solution.vertices
-            progress.update(task, completed=done + chunk.steps)
-    assert solution is not None
-    return solution
-
-
-def _rigidity(text: str) -> np.ndarray:
+def _rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     try:
-        return np.asarray(float(text))
+        values = np.asarray(float(text))
     except ValueError:
-        pass
-    if not Path(text).exists():
-        raise jd.InputError(f"--rigidity {text}: is neither a number nor a PLY file")
-    return jd.load_rigidity(text)
+        if not Path(text).exists():
+            raise jd.InputError(
+                f"--rigidity {text}: is neither a number nor the name of a PLY file that is there"
+            ) from None
+        values = jd.load_rigidity(text)
+    try:
+        check_rigidity(values, mesh.n_vertices, values.dtype)
+    except jd.InputError as error:
+        raise jd.InputError(f"--rigidity {text}: {error}") from error
+    return values
 
 
 def _make_folder(folder: Path) -> None:

@@ -402,7 +402,8 @@ class Inspection:
     def __str__(self) -> str:
         """Return the report."""
         width = max(len(name) for name in self.counts) if self.counts else 0
-        lines = [f"{name:<{width}}  {value:g}" for name, value in self.counts.items()]
+        shown = {k: str(v) if isinstance(v, int) else f"{v:g}" for k, v in self.counts.items()}
+        lines = [f"{name:<{width}}  {value}" for name, value in shown.items()]
         lines += [f"- {finding}" for finding in self.findings] or ["- nothing unusual"]
         return "\n".join(lines)
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxdeform.mesh import InputError, Mesh, write_beside
+from jaxdeform.mesh import InputError, Mesh, check_place, write_beside
 
 
 def picture(
@@ -45,12 +46,8 @@ def picture(
         True
     """
     path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: pictures are PNG files: use a .png name")
-    try:
-        import pyvista
-    except ImportError:
-        raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'") from None
+    check_picture(path)
+    import pyvista  # slow to import, and only needed here
     from vtkmodules.vtkCommonCore import vtkLogger
 
     # Without a display VTK falls back to drawing in memory, which is all we want: no warning.
@@ -93,6 +90,15 @@ def picture(
         Image.fromarray(image).save(name, format="PNG")
 
     write_beside(path, write)
+
+
+def check_picture(path: Path) -> None:
+    """Raise InputError if no picture could be written there."""
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: pictures are PNG files: use a .png name")
+    if find_spec("pyvista") is None:
+        raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'")
+    check_place(path)
 
 
 def _camera(points: Float[np.ndarray, "n 3"]):
