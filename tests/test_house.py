@@ -1,0 +1,128 @@
+"""House rules: imports go down the floors, every public name is explained, the README is true."""
+
+import ast
+import doctest
+import importlib
+import inspect
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import jaxdeform as jd
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "jaxdeform"
+
+# A file imports from lower floors, or from its own above it in this list.
+FLOORS = {
+    0: ["formats", "mesh", "laplacian", "neighborhood", "shapes", "handles"],
+    1: ["energy", "local_step", "global_step", "skinning"],
+    2: ["laplacian_editing"],
+    3: ["deformation"],
+    4: ["submesh", "estimation"],
+    5: ["batch"],
+    6: ["pictures", "viewer", "cli"],
+}
+ORDER = [(floor, name) for floor, names in FLOORS.items() for name in names]
+RANK = {name: rank for rank, (_, name) in enumerate(ORDER)}
+MODULES = sorted(path.stem for path in PACKAGE.glob("*.py") if path.stem != "__init__")
+
+
+def imported(path: Path) -> set[str]:
+    """Return the files of the package that a file imports, also inside functions."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxdeform."):
+            names.add(node.module.split(".")[1])
+        elif isinstance(node, ast.ImportFrom) and (node.level or node.module == "jaxdeform"):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names if alias.name.startswith("jaxdeform.")}
+    return names
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_only_go_down(name):
+    assert name in RANK, f"give {name}.py a floor in this table (and in the design)"
+    wrong = {
+        other for other in imported(PACKAGE / f"{name}.py") if RANK.get(other, 99) >= RANK[name]
+    }
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", sorted(jd.__all__))
+def test_every_public_name_is_explained(name):
+    thing = getattr(jd, name)
+    text = inspect.getdoc(thing)
+    assert text, f"{name} has no docstring"
+    if inspect.isfunction(thing):
+        assert "Example:" in text
+        assert ">>>" in text
+    if inspect.isclass(thing):
+        for member, value in vars(thing).items():
+            if inspect.isfunction(value) and not member.startswith("_"):
+                assert inspect.getdoc(value), f"{name}.{member} has no docstring"
+
+
+def test_public_names_are_sorted_and_there():
+    assert len(set(jd.__all__)) == len(jd.__all__)
+    public = {
+        name
+        for name, thing in vars(jd).items()
+        if (inspect.isfunction(thing) or inspect.isclass(thing)) and not name.startswith("_")
+    }
+    assert public <= set(jd.__all__)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_run(name):
+    """Minutes, nearly all of it JAX compiling."""
+    found = doctest.testmod(importlib.import_module(f"jaxdeform.{name}"))
+    assert found.failed == 0
+
+
+README = (ROOT / "README.md").read_text()
+
+
+@pytest.mark.slow
+def test_readme_python_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+    assert jd.load_rigidity(tmp_path / "bent.ply").shape == (722,)
+
+
+@pytest.mark.parametrize("name", ["demo", "tests"])
+def test_readme_commands_name_what_is_there(name):
+    """The fresh environment itself is made in continuous integration."""
+    (line,) = re.findall(rf"<!-- {name} -->\n```sh\n(.*)\n```", README)
+    words = shlex.split(line)
+    assert (ROOT / words[words.index("--constraint") + 1]).exists()
+    extras = re.search(r"\.\[([\w,]+)\]", line)
+    assert extras
+    project = (ROOT / "pyproject.toml").read_text()
+    for extra in extras[1].split(","):
+        assert re.search(rf"^{extra} = \[", project, re.MULTILINE)
+    assert line.endswith({"demo": ".venv/bin/jaxdeform demo", "tests": "python -m pytest"}[name])
+
+
+def test_readme_command_line_is_the_real_one():
+    from jaxdeform.cli import app
+
+    commands = {command.callback.__name__ for command in app.registered_commands}
+    (block,) = re.findall(r"```sh\n(jaxdeform inspect.*?)```", README, re.DOTALL)
+    for line in block.splitlines():
+        assert line.split()[1] in commands, line
+
+
+def test_linked_files_are_there():
+    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name} links {target}"
