@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 from conftest import FD, ends
 from scipy.spatial.transform import Rotation
+from sheet import bumpy_sheet
 
 import jaxdeform as jd
 
 
 @pytest.fixture(scope="module")
 def sheet() -> jd.Mesh:
-    """An open, bumpy sheet of 56 vertices, small enough for dense matrices."""
-    x, y = np.meshgrid(np.arange(8.0), np.arange(7.0))
-    z = 0.6 * np.sin(1.3 * x) * np.cos(0.9 * y)
-    low = (np.arange(7)[None] + 8 * np.arange(6)[:, None]).ravel()
-    faces = [np.stack([low, low + 1, low + 9], 1), np.stack([low, low + 9, low + 8], 1)]
-    return jd.Mesh(np.stack([x, y, z], -1).reshape(-1, 3), np.concatenate(faces))
+    return bumpy_sheet()
 
 
 HANDLES = np.array([0, 7, 27, 48, 55])

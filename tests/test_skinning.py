@@ -8,6 +8,7 @@ import scipy.optimize
 import scipy.sparse as sp
 from conftest import EXACT, FD
 from scipy.spatial.transform import Rotation
+from sheet import bumpy_sheet
 
 import jaxdeform as jd
 
@@ -355,14 +356,6 @@ def test_geodesic_distances():
     np.testing.assert_allclose(apart[:9, 0], flat[:, 1], atol=1e-7)
     assert np.isinf(apart[9:, 0]).all()
     assert apart[18, 1] == 0
-
-
-def bumpy_sheet():
-    x, y = np.meshgrid(np.arange(8.0), np.arange(7.0))
-    z = 0.6 * np.sin(1.3 * x) * np.cos(0.9 * y)
-    low = (np.arange(7)[None] + 8 * np.arange(6)[:, None]).ravel()
-    faces = [np.stack([low, low + 1, low + 9], 1), np.stack([low, low + 9, low + 8], 1)]
-    return jd.Mesh(np.stack([x, y, z], -1).reshape(-1, 3), np.concatenate(faces))
 
 
 def test_biharmonic_weights_by_bounded_least_squares():
