@@ -1,5 +1,6 @@
-"""The command line: ``jaxdeform demo | inspect | deform``."""
+"""The command line: ``jaxdeform demo | inspect | deform | estimate``."""
 
+import json
 import os
 import signal
 import sys
@@ -23,6 +24,8 @@ jax.config.update("jax_enable_x64", True)
 
 import jaxdeform as jd  # noqa: E402 (after x64)
 from jaxdeform.deformation import check_rigidity  # noqa: E402
+from jaxdeform.estimation import check_parts  # noqa: E402
+from jaxdeform.mesh import check_place, write_beside  # noqa: E402
 from jaxdeform.pictures import check_picture  # noqa: E402
 
 app = typer.Typer(
@@ -181,6 +184,114 @@ def deform(
         colors = [None, values] if values.ndim else []
         jd.picture(picture, shape, poses, titles=["rest", "deformed"], values=colors)
         console.print(f"wrote {picture}")
+
+
+@app.command()
+def estimate(
+    rest: Annotated[Path, typer.Argument(help="The undeformed mesh: OBJ, OFF, PLY or STL file.")],
+    poses: Annotated[list[Path], typer.Argument(help="Deformed meshes with the same faces.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help=".ply file for the rigidity.")],
+    handles: Annotated[
+        Path | None, typer.Option(help="Handle file; what moved rigidly if left out.")
+    ] = None,
+    parts: Annotated[
+        Path | None, typer.Option(help="The part of each vertex from 0: a number a line, or .json.")
+    ] = None,
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            help="For finding handles: how exactly they moved rigidly, as a part of "
+            "the bounding box diagonal."
+        ),
+    ] = 1e-6,
+    rings: Annotated[int, typer.Option(min=1, help="Size of the neighbourhoods.")] = 1,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="This many alternating steps; to convergence if left out."),
+    ] = None,
+) -> None:
+    """Estimate how rigid a mesh or its parts are, from deformed poses."""
+    shape = jd.load_mesh(rest)
+    jd.check_output(out)
+    report = out.with_suffix(".json")
+    if out.suffix.lower() != ".ply":
+        raise jd.InputError(f"{out}: only PLY carries rigidity per vertex: use a .ply name")
+    check_place(report)
+    observed = np.stack([_pose(path, shape, rest) for path in poses])
+    label = np.zeros(shape.n_vertices, int) if parts is None else _parts(parts, shape)
+    if handles is None:
+        groups = jd.find_handle_groups(shape, observed, tolerance=tolerance)
+        held = np.unique(np.concatenate([group.vertices for group in groups]))
+        sizes = ", ".join(str(len(group.vertices)) for group in groups[:10])
+        more = ", ..." if len(groups) > 10 else ""
+        console.print(f"{len(groups)} groups of vertices moved rigidly ({sizes}{more}): handles")
+    else:
+        held = jd.load_handles(handles, shape).handles
+    solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
+    began = time.perf_counter()
+    problem = _patiently(
+        "precomputing", lambda: jd.precompute(shape, held, cells=jd.rings(shape, rings))
+    )
+
+    def show(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
+        values = ", ".join(f"{value:.3g}" for value in rigidity[:5])
+        console.print(f"evaluation {evaluation}: misfit {misfit:.4g}, rigidity {values}")
+
+    fit = _patiently(
+        "estimating",
+        lambda: jd.estimate_rigidity(problem, observed, parts=label, solver=solver, progress=show),
+    )
+    table = Table("part", "vertices", "rigidity", "95 % interval", "verdict")
+    for k, (value, (low, high)) in enumerate(zip(fit.rigidity, fit.interval, strict=True)):
+        size = str(int((label == k).sum()))
+        table.add_row(str(k), size, f"{value:.4g}", f"{low:.4g} to {high:.4g}", fit.verdict[k])
+    console.print(table)
+    console.print(f"misfit {fit.misfit:.4g} after {len(fit.history)} evaluations, {_since(began)}")
+    console.print(str(fit.result))
+    jd.save_mesh(out, shape, rigidity=fit.field)
+    text = json.dumps(_as_json(fit, held), indent=1, allow_nan=False)
+    write_beside(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
+    console.print(f"wrote {out} and {report}")
+
+
+def _pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:
+    pose = jd.load_mesh(path)
+    if pose.n_vertices != rest.n_vertices or not np.array_equal(pose.faces, rest.faces):
+        raise jd.InputError(
+            f"{path}: is no pose of {name}: {pose} and {rest} must have the same vertices and "
+            "faces in the same order"
+        )
+    return pose.vertices
+
+
+def _parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix.lower() == ".json" else text.split()
+        label = np.array([int(value) for value in values])
+    except (OSError, ValueError, TypeError) as error:
+        raise jd.InputError(
+            f"{path}: cannot be read as one integer per vertex ({error})"
+        ) from error
+    try:
+        return check_parts(label, mesh.n_vertices)
+    except jd.InputError as error:
+        raise jd.InputError(f"{path}: {error}") from error
+
+
+def _as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
+    """Return what the estimate says; null stands for infinity, which JSON has not."""
+    finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
+    return {
+        "parts": [
+            {"rigidity": float(value), "interval": list(map(finite, pair)), "verdict": verdict}
+            for value, pair, verdict in zip(fit.rigidity, fit.interval, fit.verdict, strict=True)
+        ],
+        "misfit": finite(fit.misfit),
+        "history": list(map(finite, fit.history)),
+        "result": {"ok": fit.result.ok, "sentence": str(fit.result)},
+        "handles": handles.tolist(),
+    }
 
 
 def _rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:

@@ -46,7 +46,8 @@ _WIDE = 0.5
 _BOUND_WIDTH = 0.05
 # Evaluations to fit the other parts anew, for one value of the part whose bounds are sought.
 _PROFILE_EVALUATIONS = 5
-_PROBES = 4
+# Of the bar's 438 handle coordinates about 40 move the rest by more than themselves.
+_MODES = 48
 # Rounds of growing and fitting again; on the real meshes 3 to 8 are needed.
 _GROWTHS = 50
 
@@ -123,8 +124,9 @@ def estimate_rigidity(
 
     The intervals take the observed positions as the model plus independent noise of equal size at
     all coordinates. Where targets are taken from the observed poses, the handles carry that noise
-    too: the residual is then that of the free vertices minus D times that of the handles,
-    D = d vertices / d targets, and the interval is widened by it. A part whose interval is wide is
+    too and pass it on, often enlarged: the covariance of the residual is then I + D D^T, where D is
+    d vertices / d targets. That is a few dozen modes above the identity, found by random probing,
+    and a second search weighs the residual by its inverse. A part whose interval is wide is
     followed to both ends (the other parts fitted anew); where the misfit cannot be told from the
     best one all the way, the interval ends at 0 or infinity.
 
@@ -165,7 +167,7 @@ def estimate_rigidity(
     """
     n = problem.n_vertices
     poses = _check_poses(problem, observed, targets, mask)
-    label = _check_parts(parts, n)
+    label = check_parts(np.zeros(n, int) if parts is None else parts, n)
     count = int(label.max()) + 1
     adjoint = adjoint or (Unrolled() if isinstance(solver, Alternating) else Implicit())
     scale = np.asarray(material(problem, 1.0), np.float64)
@@ -176,53 +178,56 @@ def estimate_rigidity(
     theta = np.clip(np.log(_check_start(start, 0.1 * size)), *box)
     history: list[float] = []
 
-    def evaluate(theta: np.ndarray) -> _Fit:
-        fields = _normal_equations(problem, poses, label, theta, solver, adjoint)
-        return _Fit(theta, *(np.asarray(field) for field in fields))
+    def evaluate(theta: np.ndarray, modes: np.ndarray | None) -> _Fit:
+        run = _deform_all(problem, poses, label, theta, solver, adjoint)
+        vertices, jacobian, residual = map(np.asarray, run)
+        return _normal_equations(theta, vertices, jacobian, residual, modes)
 
-    def counted(theta: np.ndarray) -> _Fit:
-        at = evaluate(theta)
-        history.append(poses.root_mean_square(at.cost))
+    def counted(theta: np.ndarray, modes: np.ndarray | None) -> _Fit:
+        at = evaluate(theta, modes)
+        history.append(poses.root_mean_square(at.residual))
         if progress is not None:
             progress(len(history), history[-1], np.exp(theta))
         return at
 
     step = partial(_box_step, box=box)
-    best, ending = _descend(counted, step, counted(theta), max_evaluations - 1)
-    cost, noise = best.cost, np.zeros((count, count))
-    freedom = poses.count - count
-    if targets is None:
-        noise, spread = _handle_noise(problem, poses, label, best, solver, adjoint)
-        freedom = freedom + float(spread)
+    modes = None
+    at = counted(theta, modes)
+    best, ending = _descend(partial(counted, modes=modes), step, at, max_evaluations - 1)
+    if targets is None and ending.ok:
+        modes = np.asarray(_handle_modes(problem, poses, np.exp(best.theta)[label], solver))
+        at = _normal_equations(best.theta, best.vertices, best.jacobian, best.residual, modes)
+        best, ending = _descend(
+            partial(counted, modes=modes), step, at, max_evaluations - len(history)
+        )
+    at_value = partial(evaluate, modes=modes)
     floor = (_EQUAL * _diagonal(problem)) ** 2
-    variance = max(cost / max(freedom, 1), floor)
+    variance = max(best.cost / max(poses.count - count, 1), floor)
     ridge = np.finfo(float).eps * (np.trace(best.normal) + floor)
-    inverse = np.linalg.inv(best.normal + ridge * np.eye(count))
-    covariance = variance * inverse @ (best.normal + np.asarray(noise)) @ inverse
+    covariance = variance * np.linalg.inv(best.normal + ridge * np.eye(count))
 
     def profile(k: int, value: float) -> float:
         """Cost with part k held at a value and all others fitted anew."""
         held = box.copy()
         held[:, k] = value
-        at = evaluate(np.clip(best.theta, *held))
+        at = at_value(np.clip(best.theta, *held))
         if count > 1:
-            at, _ = _descend(evaluate, partial(_box_step, box=held), at, _PROFILE_EVALUATIONS)
+            at, _ = _descend(at_value, partial(_box_step, box=held), at, _PROFILE_EVALUATIONS)
         return at.cost
 
     def looks_the_same(k: int, value: float) -> bool:
-        at = evaluate(np.where(np.arange(count) == k, value, best.theta))
+        at = at_value(np.where(np.arange(count) == k, value, best.theta))
         moved = np.where(poses.counted[..., None], at.vertices - best.vertices, 0.0)
         return bool(np.linalg.norm(moved, axis=-1).max() <= visible * _diagonal(problem))
 
+    allowed = best.cost + _Z**2 * variance
     logs, same = np.empty((count, 2)), np.empty((count, 2), bool)
     for k in range(count):
         deviation = _Z * np.sqrt(max(covariance[k, k], 0.0))
-        # The misfit that noise alone explains, in the direction of this part.
-        allowed = cost + deviation**2 / max(inverse[k, k], np.finfo(float).tiny)
         logs[k] = best.theta[k] - deviation, best.theta[k] + deviation
         if deviation > _WIDE:
-            ends = [partial(profile, k), best.theta[k], allowed]
-            logs[k] = _bound(*ends, box[0, k], -np.inf), _bound(*ends, box[1, k], np.inf)
+            crossing = partial(_bound, partial(profile, k), best.theta[k], allowed)
+            logs[k] = crossing(box[0, k], -np.inf), crossing(box[1, k], np.inf)
         same[k] = looks_the_same(k, box[0, k]), looks_the_same(k, box[1, k])
     interval = np.exp(logs)
     return Estimate(
@@ -231,7 +236,7 @@ def estimate_rigidity(
         verdict=tuple(map(_verdict, interval, same)),
         field=np.exp(best.theta)[label],
         vertices=best.vertices,
-        misfit=poses.root_mean_square(cost),
+        misfit=poses.root_mean_square(best.residual),
         history=np.array(history),
         result=ending,
     )
@@ -250,9 +255,9 @@ def _verdict(interval: Float[np.ndarray, "2"], same: Bool[np.ndarray, "2"]) -> s
 class _Poses(NamedTuple):
     """The observed poses, as compiled functions take them."""
 
-    targets: Float[Array, "poses h 3"]
-    observed: Float[Array, "poses n 3"]
-    counted: Bool[Array, "poses n"]
+    targets: Float[np.ndarray, "poses h 3"]
+    observed: Float[np.ndarray, "poses n 3"]
+    counted: Bool[np.ndarray, "poses n"]
     """Vertices that are free and were seen; the others' positions are 0 here."""
 
     @property
@@ -260,9 +265,9 @@ class _Poses(NamedTuple):
         """Number of coordinates compared."""
         return 3 * int(np.sum(self.counted))
 
-    def root_mean_square(self, cost: float) -> float:
-        """Turn a sum of squares into a length."""
-        return float(np.sqrt(cost / max(self.count, 1)))
+    def root_mean_square(self, residual: Float[np.ndarray, "poses n 3"]) -> float:
+        """Return the misfit: a length."""
+        return float(np.sqrt(np.sum(residual**2) / max(self.count, 1)))
 
 
 class _Fit(NamedTuple):
@@ -271,12 +276,27 @@ class _Fit(NamedTuple):
     theta: Float[np.ndarray, "parts"]
     vertices: Float[np.ndarray, "poses n 3"]
     jacobian: Float[np.ndarray, "poses n 3 parts"]
+    residual: Float[np.ndarray, "poses n 3"]
     normal: Float[np.ndarray, "parts parts"]
-    """J^T J."""
+    """J^T W J, W the inverse covariance of the residual (for noise of size 1)."""
     gradient: Float[np.ndarray, "parts"]
-    """J^T r."""
-    cost: Float[np.ndarray, ""]
-    """|r|^2."""
+    """J^T W r."""
+    cost: float
+    """r^T W r."""
+
+
+def _normal_equations(theta, vertices, jacobian, residual, modes) -> _Fit:
+    """Weigh the equations by W = (I + U U^T)^-1, U the modes of the handles' noise, or by 1."""
+    poses, count = len(residual), len(theta)
+    columns = np.concatenate([jacobian, residual[..., None]], axis=-1).reshape(poses, -1, count + 1)
+    product = np.einsum("pia,pib->ab", columns, columns)
+    if modes is not None:
+        # Woodbury: W = I - U (I + U^T U)^-1 U^T.
+        within = np.swapaxes(modes, 1, 2) @ columns
+        inner = np.eye(modes.shape[2]) + np.swapaxes(modes, 1, 2) @ modes
+        product -= np.einsum("pka,pkb->ab", within, np.linalg.solve(inner, within))
+    normal, gradient = product[:-1, :-1], product[:-1, -1]
+    return _Fit(theta, vertices, jacobian, residual, normal, gradient, float(product[-1, -1]))
 
 
 def _deformed(problem: Problem, targets, field, solver, adjoint) -> Float[Array, "poses n 3"]:
@@ -285,13 +305,10 @@ def _deformed(problem: Problem, targets, field, solver, adjoint) -> Float[Array,
     return jax.lax.map(pose, targets)
 
 
-def _residual(poses: _Poses, vertices) -> Float[Array, "poses n 3"]:
-    return jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
-
-
 @partial(jax.jit, static_argnames=("solver", "adjoint"))
-def _normal_equations(problem, poses, label, theta, solver, adjoint):
-    """Return what :class:`_Fit` holds beside theta; J by forward mode, all parts at once."""
+def _deform_all(problem, poses, label, theta, solver, adjoint):
+    """Return the deformed poses, their derivatives to theta (forward mode, all parts at once), and
+    the residual, both 0 at vertices that do not count."""
 
     def run(theta):
         return _deformed(problem, poses.targets, jnp.exp(theta)[label], solver, adjoint)
@@ -299,31 +316,38 @@ def _normal_equations(problem, poses, label, theta, solver, adjoint):
     push = lambda direction: jax.jvp(run, (theta,), (direction,))  # noqa: E731
     vertices, jacobian = jax.vmap(push, out_axes=(None, -1))(jnp.eye(len(theta), dtype=theta.dtype))
     jacobian = jnp.where(poses.counted[..., None, None], jacobian, 0.0)
-    residual = _residual(poses, vertices)
-    normal = jnp.einsum("pnai,pnaj->ij", jacobian, jacobian)
-    gradient = jnp.einsum("pnai,pna->i", jacobian, residual)
-    return vertices, jacobian, normal, gradient, jnp.sum(residual**2)
+    return vertices, jacobian, _residual(poses, vertices)
 
 
-@partial(jax.jit, static_argnames=("solver", "adjoint"))
-def _handle_noise(problem, poses, label, fit, solver, adjoint):
-    """Return (D^T J)^T (D^T J) and |D|_F^2, D = d vertices / d targets.
+def _residual(poses: _Poses, vertices) -> Float[Array, "poses n 3"]:
+    return jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
 
-    The norm is Hutchinson's estimate, from a few random signs.
+
+@partial(jax.jit, static_argnames="solver")
+def _handle_modes(problem, poses, field, solver) -> Float[Array, "poses coordinates modes"]:
+    """Return U (per pose) with U U^T nearly D D^T, D = d vertices / d targets.
+
+    A randomised range finder (Halko, Martinsson and Tropp 2011): D^T of random vectors spans the
+    motions of the handles that move the rest most. Always implicit and to four digits, since it
+    describes noise only.
     """
+    adjoint = Implicit(tolerance=1e-4)
+    count = min(_MODES, 3 * poses.targets.shape[1])
 
-    def run(targets):
-        return _deformed(problem, targets, jnp.exp(fit.theta)[label], solver, adjoint)
+    def modes(targets, counted):
+        def run(targets):
+            vertices = deform(problem, targets, field, solver=solver, adjoint=adjoint).vertices
+            return jnp.where(counted[:, None], vertices, 0.0)
 
-    _, pull = jax.vjp(run, poses.targets)
-    shape = (_PROBES, *fit.vertices.shape)
-    signs = jax.random.rademacher(jax.random.key(0), shape, dtype=fit.vertices.dtype)
-    signs = jnp.where(poses.counted[None, ..., None], signs, 0.0)
-    rows = jnp.concatenate([jnp.moveaxis(fit.jacobian, -1, 0), signs])
-    (pulled,) = jax.vmap(pull)(rows)
-    pulled = pulled.reshape(len(rows), -1)
-    columns, probes = pulled[:-_PROBES], pulled[-_PROBES:]
-    return columns @ columns.T, jnp.sum(probes**2) / _PROBES
+        vertices, push = jax.linearize(run, targets)
+        pull = jax.linear_transpose(push, targets)
+        probes = jax.random.normal(jax.random.key(0), (count, *vertices.shape), vertices.dtype)
+        (rows,) = jax.vmap(pull)(probes)
+        basis, _ = jnp.linalg.qr(rows.reshape(count, -1).T)
+        moved = jax.vmap(push)(basis.T.reshape(count, *targets.shape))
+        return moved.reshape(count, -1).T
+
+    return jax.lax.map(lambda pose: modes(*pose), (poses.targets, poses.counted))
 
 
 # ---------------------------------------------------------------- which vertices were held
@@ -682,9 +706,8 @@ def _check_poses(problem: Problem, observed, targets, mask) -> _Poses:
     return _Poses(goal, np.where(counted[..., None], given, 0.0).astype(dtype), counted)
 
 
-def _check_parts(parts, n: int) -> Int[np.ndarray, "n"]:
-    if parts is None:
-        return np.zeros(n, np.int32)
+def check_parts(parts: ArrayLike, n: int) -> Int[np.ndarray, "n"]:
+    """Return the part of each vertex, or raise InputError naming what is wrong."""
     label = np.asarray(parts)
     if label.shape != (n,) or label.dtype.kind not in "iu":
         raise InputError(
