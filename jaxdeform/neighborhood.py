@@ -70,7 +70,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     Example:
         >>> import jaxdeform as jd
         >>> jd.rings(jd.shapes.bar(), 2)
-        Cells(722 cells, 2160 edges, 40.0 edges a cell)
+        Cells(722 cells, 2160 edges, 41.8 edges a cell)
     """
     n = mesh.n_vertices
     radius = np.asarray(r)
