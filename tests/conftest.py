@@ -5,12 +5,21 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-import jaxdeform as jd  # noqa: E402 (after x64)
+# The annotations of the floors that take plain arrays are checked at every call. Not those of the
+# public functions: they take whatever numpy can read (at run time no type says so), and misuse
+# must reach their own checks.
+install_import_hook(
+    [f"jaxdeform.{name}" for name in ("formats", "laplacian", "energy", "global_step")],
+    "beartype.beartype",
+)
+
+import jaxdeform as jd  # noqa: E402 (after x64 and the hook)
 
 EXACT = 1e-10
 """float64 algebra."""
