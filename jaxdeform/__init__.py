@@ -16,9 +16,11 @@ from jaxdeform.deformation import (
 )
 from jaxdeform.estimation import (
     Estimate,
+    FieldEstimate,
     RigidGroup,
     ThesisEstimate,
     estimate_rigidity,
+    estimate_rigidity_field,
     estimate_rigidity_thesis,
     find_handle_groups,
     find_handles,
@@ -61,6 +63,7 @@ __all__ = [
     "Alternating",
     "Cells",
     "Estimate",
+    "FieldEstimate",
     "GradientDescent",
     "HandleFile",
     "Implicit",
@@ -88,6 +91,7 @@ __all__ = [
     "dual_quaternion_skinning",
     "energy",
     "estimate_rigidity",
+    "estimate_rigidity_field",
     "estimate_rigidity_thesis",
     "find_handle_groups",
     "find_handles",

@@ -26,7 +26,10 @@ from jaxdeform.deformation import (
     deform,
     material,
 )
+from jaxdeform.energy import Rows
+from jaxdeform.global_step import Factor, factorise
 from jaxdeform.handles import as_array, check_positions
+from jaxdeform.laplacian import cotangent_weights, graph_laplacian
 from jaxdeform.mesh import InputError, Mesh
 
 # Outside of these, as material constants (rigidity over tr(B) / 2), nothing changes any more: the
@@ -47,7 +50,13 @@ _BOUND_WIDTH = 0.05
 # Evaluations to fit the other parts anew, for one value of the part whose bounds are sought.
 _PROFILE_EVALUATIONS = 5
 # Of the bar's 438 handle coordinates about 40 move the rest by more than themselves.
-_MODES = 48
+_MODES = 64
+_PROBES = 8
+_FOR_NOISE = Implicit(tolerance=1e-5)
+# Conjugate gradients of one Gauss-Newton step of a field: it need not be exact.
+_CG_TOLERANCE, _CG_STEPS = 1e-2, 60
+# Standard deviations from so many samples are good to 12 %.
+_SAMPLES = 32
 # Rounds of growing and fitting again; on the real meshes 3 to 8 are needed.
 _GROWTHS = 50
 
@@ -202,9 +211,14 @@ def estimate_rigidity(
         )
     at_value = partial(evaluate, modes=modes)
     floor = (_EQUAL * _diagonal(problem)) ** 2
-    variance = max(best.cost / max(poses.count - count, 1), floor)
+    freedom, meat = poses.count - count, best.normal
+    if modes is not None:
+        field = np.exp(best.theta)[label]
+        freedom, meat = _sandwich(problem, poses, field, best.jacobian, modes, solver)
+    variance = max(best.cost / max(freedom, 1), floor)
     ridge = np.finfo(float).eps * (np.trace(best.normal) + floor)
-    covariance = variance * np.linalg.inv(best.normal + ridge * np.eye(count))
+    inverse = np.linalg.inv(best.normal + ridge * np.eye(count))
+    spread = inverse @ meat @ inverse
 
     def profile(k: int, value: float) -> float:
         """Cost with part k held at a value and all others fitted anew."""
@@ -220,12 +234,12 @@ def estimate_rigidity(
         moved = np.where(poses.counted[..., None], at.vertices - best.vertices, 0.0)
         return bool(np.linalg.norm(moved, axis=-1).max() <= visible * _diagonal(problem))
 
-    allowed = best.cost + _Z**2 * variance
     logs, same = np.empty((count, 2)), np.empty((count, 2), bool)
     for k in range(count):
-        deviation = _Z * np.sqrt(max(covariance[k, k], 0.0))
+        deviation = _Z * np.sqrt(max(variance * spread[k, k], 0.0))
         logs[k] = best.theta[k] - deviation, best.theta[k] + deviation
         if deviation > _WIDE:
+            allowed = best.cost + deviation**2 / inverse[k, k]
             crossing = partial(_bound, partial(profile, k), best.theta[k], allowed)
             logs[k] = crossing(box[0, k], -np.inf), crossing(box[1, k], np.inf)
         same[k] = looks_the_same(k, box[0, k]), looks_the_same(k, box[1, k])
@@ -287,16 +301,40 @@ class _Fit(NamedTuple):
 
 def _normal_equations(theta, vertices, jacobian, residual, modes) -> _Fit:
     """Weigh the equations by W = (I + U U^T)^-1, U the modes of the handles' noise, or by 1."""
-    poses, count = len(residual), len(theta)
-    columns = np.concatenate([jacobian, residual[..., None]], axis=-1).reshape(poses, -1, count + 1)
-    product = np.einsum("pia,pib->ab", columns, columns)
-    if modes is not None:
-        # Woodbury: W = I - U (I + U^T U)^-1 U^T.
-        within = np.swapaxes(modes, 1, 2) @ columns
-        inner = np.eye(modes.shape[2]) + np.swapaxes(modes, 1, 2) @ modes
-        product -= np.einsum("pka,pkb->ab", within, np.linalg.solve(inner, within))
+    columns = np.concatenate([jacobian, residual[..., None]], axis=-1)
+    columns = columns.reshape(len(residual), -1, len(theta) + 1)
+    product = np.einsum("pia,pib->ab", columns, _weigh(columns, modes))
     normal, gradient = product[:-1, :-1], product[:-1, -1]
     return _Fit(theta, vertices, jacobian, residual, normal, gradient, float(product[-1, -1]))
+
+
+def _weigh(columns: Float[np.ndarray, "poses coordinates k"], modes) -> np.ndarray:
+    """Return W times columns; Woodbury: W = I - U (I + U^T U)^-1 U^T."""
+    if modes is None:
+        return columns
+    transposed = np.swapaxes(modes, 1, 2)
+    inner = np.eye(modes.shape[2]) + transposed @ modes
+    return columns - modes @ np.linalg.solve(inner, transposed @ columns)
+
+
+def _sandwich(problem, poses, field, jacobian, modes, solver) -> tuple[float, np.ndarray]:
+    """Return the degrees of freedom tr(W S) - p and J^T W S W J, with S = I + D D^T exactly.
+
+    So the interval is right although the modes in W are few. The trace is Hutchinson's estimate.
+    """
+    shape, count = poses.observed.shape, jacobian.shape[-1]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (*shape, _PROBES))
+    signs = np.where(poses.counted[..., None, None], signs, 0.0)
+    flat = np.concatenate([jacobian, signs], axis=-1).reshape(shape[0], -1, count + _PROBES)
+    weighed = _weigh(flat, modes)
+    rows = np.concatenate([weighed, flat[..., count:]], axis=-1)
+    rows = np.moveaxis(rows, -1, 0).reshape(-1, *shape).astype(problem.dtype)
+    pulled = np.asarray(_pull_to_handles(problem, poses, field, rows, solver))
+    pulled = pulled.reshape(len(rows), -1)
+    part, both, bare = np.split(pulled, [count, count + _PROBES])
+    meat = np.einsum("pia,pib->ab", weighed[..., :count], weighed[..., :count]) + part @ part.T
+    trace = np.sum(flat[..., count:] * weighed[..., count:]) + np.sum(both * bare)
+    return float(trace) / _PROBES - count, meat
 
 
 def _deformed(problem: Problem, targets, field, solver, adjoint) -> Float[Array, "poses n 3"]:
@@ -324,19 +362,28 @@ def _residual(poses: _Poses, vertices) -> Float[Array, "poses n 3"]:
 
 
 @partial(jax.jit, static_argnames="solver")
+def _pull_to_handles(problem, poses, field, rows, solver) -> Float[Array, "k poses h 3"]:
+    """Return D^T of each row; implicit, since it describes noise only."""
+
+    def run(targets):
+        return _deformed(problem, targets, field, solver, _FOR_NOISE)
+
+    _, pull = jax.vjp(run, poses.targets)
+    return jax.vmap(pull)(rows)[0]
+
+
+@partial(jax.jit, static_argnames="solver")
 def _handle_modes(problem, poses, field, solver) -> Float[Array, "poses coordinates modes"]:
     """Return U (per pose) with U U^T nearly D D^T, D = d vertices / d targets.
 
     A randomised range finder (Halko, Martinsson and Tropp 2011): D^T of random vectors spans the
-    motions of the handles that move the rest most. Always implicit and to four digits, since it
-    describes noise only.
+    motions of the handles that move the rest most.
     """
-    adjoint = Implicit(tolerance=1e-4)
     count = min(_MODES, 3 * poses.targets.shape[1])
 
     def modes(targets, counted):
         def run(targets):
-            vertices = deform(problem, targets, field, solver=solver, adjoint=adjoint).vertices
+            vertices = deform(problem, targets, field, solver=solver, adjoint=_FOR_NOISE).vertices
             return jnp.where(counted[:, None], vertices, 0.0)
 
         vertices, push = jax.linearize(run, targets)
@@ -348,6 +395,210 @@ def _handle_modes(problem, poses, field, solver) -> Float[Array, "poses coordina
         return moved.reshape(count, -1).T
 
     return jax.lax.map(lambda pose: modes(*pose), (poses.targets, poses.counted))
+
+
+# ---------------------------------------------------------------- a rigidity that varies smoothly
+
+
+class FieldEstimate(NamedTuple):
+    """A rigidity per vertex, as :func:`estimate_rigidity_field` finds it."""
+
+    field: Float[np.ndarray, "n"]
+    interval: Float[np.ndarray, "n 2"]
+    """95 % interval under the prior: wide where only the neighbours say something."""
+    vertices: Float[np.ndarray, "poses n 3"]
+    """The fitted poses."""
+    misfit: float
+    """Root mean square of the differences between fitted and observed coordinates (a length)."""
+    history: Float[np.ndarray, "evaluations"]
+    """Misfit of each evaluation, accepted or not."""
+    result: Ending
+
+
+def estimate_rigidity_field(
+    problem: Problem,
+    observed: ArrayLike,
+    *,
+    smoothness: float = 1e-8,
+    targets: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    solver: Alternating | QuasiNewton = QuasiNewton(),  # noqa: B008 (frozen)
+    adjoint: Unrolled | Implicit | None = None,
+    max_evaluations: int = 30,
+    progress: Callable[[int, float, np.ndarray], None] | None = None,
+) -> FieldEstimate:
+    """Estimate a rigidity that varies smoothly over the mesh: one unknown per vertex.
+
+    Minimises ``sum |deform(rigidity) - observed|^2 / diagonal^2 + smoothness * t^T L t`` over the
+    logarithm t of the rigidity, where L is the cotangent Laplacian: ``t^T L t`` is the integral of
+    |grad t|^2 over the surface, a pure number that does not change with scale or resolution.
+
+    Gauss-Newton, matrix-free: products with J and its transpose are one linear solve each at the
+    converged deformation (implicit), inside conjugate gradients that L preconditions.
+
+    **Arguments**
+
+    - problem, observed, targets, mask, solver, adjoint, max_evaluations, progress: as
+      :func:`estimate_rigidity`.
+    - smoothness: weight of the prior. The most probable field has it equal to
+      ``(noise / (diagonal * slope))^2``, with the standard deviation of the noise of a coordinate
+      and of the difference of log rigidity between neighbours. The default is noise of 1e-4 of the
+      bounding box diagonal and slope 1. More smooths.
+    - start: a number or (n,); a medium material if left out.
+
+    **Returns** a :class:`FieldEstimate`. Its interval takes targets as exact.
+
+    **Raises** InputError as :func:`estimate_rigidity`; smoothness not above 0.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.square()
+        >>> problem = jd.precompute(mesh, [0, 1, 2, 6, 7, 8])
+        >>> targets = jd.twist(mesh.vertices[problem.handles], 60.0, along="y")
+        >>> pose = jd.deform(problem, targets, 0.5).vertices
+        >>> jd.estimate_rigidity_field(problem, pose).field.shape
+        (9,)
+    """
+    if not (np.isfinite(smoothness) and smoothness > 0):
+        raise InputError(
+            f"smoothness is {smoothness}: give a number above 0, without it vertices that the "
+            "poses say nothing about have no value"
+        )
+    n, dtype = problem.n_vertices, problem.dtype
+    poses = _check_poses(problem, observed, targets, mask)
+    adjoint = adjoint or (Unrolled() if isinstance(solver, Alternating) else Implicit())
+    size = np.asarray(material(problem, 1.0), np.float64)
+    size = np.where(size > 0, size, size.mean())
+    box = np.log([_SOFTEST * size, _STIFFEST * size])
+    theta = np.clip(np.log(_check_start(start, np.full(n, 0.1 * np.median(size)))), *box)
+    prior, anchor = _prior(problem, smoothness * _diagonal(problem) ** 2)
+    history: list[float] = []
+
+    def evaluate(theta: np.ndarray) -> _FieldFit:
+        run = _field_step(problem, poses, prior, jnp.asarray(theta, dtype), solver, adjoint)
+        vertices, residual, move, gain, cost = map(np.asarray, run)
+        history.append(poses.root_mean_square(residual))
+        if progress is not None:
+            progress(len(history), history[-1], np.exp(theta))
+        return _FieldFit(theta, vertices, residual, move, float(gain), float(cost))
+
+    def step(at: _FieldFit, radius: float):
+        part = min(1.0, radius / max(float(np.abs(at.move).max()), 1e-300))
+        move = np.clip(at.theta + part * at.move, *box) - at.theta
+        return move, at.gain * part * (2.0 - part)
+
+    best, ending = _descend(evaluate, step, evaluate(theta), max_evaluations - 1, enough=1e-6)
+    misfit = poses.root_mean_square(best.residual)
+    noise = max(misfit, _EQUAL * _diagonal(problem))
+    spread = _field_spread(problem, poses, prior, jnp.asarray(best.theta, dtype), solver, adjoint)
+    deviation = _Z * noise * np.asarray(spread)
+    del anchor
+    return FieldEstimate(
+        field=np.exp(best.theta),
+        interval=np.exp(best.theta[:, None] + deviation[:, None] * np.array([-1.0, 1.0])),
+        vertices=best.vertices,
+        misfit=misfit,
+        history=np.array(history),
+        result=ending,
+    )
+
+
+class _FieldFit(NamedTuple):
+    theta: Float[np.ndarray, "n"]
+    vertices: Float[np.ndarray, "poses n 3"]
+    residual: Float[np.ndarray, "poses n 3"]
+    move: Float[np.ndarray, "n"]
+    """The Gauss-Newton step."""
+    gain: float
+    cost: float
+
+
+class _Prior(NamedTuple):
+    """The weighted Laplacian of log rigidity, as compiled functions take it."""
+
+    laplacian: Rows
+    factor: Factor
+    weight: Float[Array, ""]
+    root: Float[Array, "edges"]
+    """Square roots of the edge weights: L = D^T root^2 D."""
+    edges: Int[Array, "edges 2"]
+
+
+def _prior(problem: Problem, weight: float) -> tuple[_Prior, object]:
+    """Return the prior, and what keeps its factor alive."""
+    mesh = Mesh(problem.vertices, problem.system.faces)
+    # Where obtuse angles make them negative, differences would be rewarded.
+    weights = cotangent_weights(mesh)
+    weights = np.maximum(weights, 1e-3 * np.abs(weights).mean())
+    laplacian = graph_laplacian(mesh.edges, weights, mesh.n_vertices)
+    # Constants cost nothing; the preconditioner needs them to cost a little.
+    shifted = laplacian + 1e-2 * sp.identity(mesh.n_vertices)
+    everywhere = np.ones(mesh.n_vertices, bool)
+    dtype = problem.dtype
+    factor, anchor = factorise(shifted.tocsr(), everywhere, dtype)
+    prior = _Prior(
+        Rows.build([laplacian], dtype),
+        factor,
+        jnp.asarray(weight, dtype),
+        jnp.asarray(np.sqrt(weights), dtype),
+        jnp.asarray(mesh.edges, jnp.int32),
+    )
+    return prior, anchor
+
+
+def _linear_model(problem, poses, prior, theta, solver, adjoint):
+    """Return vertices, residual, J^T, and a solver of (J^T J + weight L) x = right."""
+
+    def run(theta):
+        vertices = _deformed(problem, poses.targets, jnp.exp(theta), solver, adjoint)
+        return _residual(poses, vertices), vertices
+
+    residual, push, vertices = jax.linearize(run, theta, has_aux=True)
+    transposed = jax.linear_transpose(push, theta)
+    pull = lambda r: transposed(r)[0]  # noqa: E731
+
+    def solve(right):
+        product = lambda x: pull(push(x)) + prior.weight * prior.laplacian.apply(x)  # noqa: E731
+        precondition = lambda r: prior.factor.solve(r) / prior.weight  # noqa: E731
+        return jax.scipy.sparse.linalg.cg(
+            product, right, tol=_CG_TOLERANCE, maxiter=_CG_STEPS, M=precondition
+        )[0]
+
+    return vertices, residual, pull, solve
+
+
+@partial(jax.jit, static_argnames=("solver", "adjoint"))
+def _field_step(problem, poses, prior, theta, solver, adjoint):
+    """Return what :class:`_FieldFit` holds beside theta."""
+    model = _linear_model(problem, poses, prior, theta, solver, adjoint)
+    vertices, residual, pull, solve = model
+    rough = prior.weight * prior.laplacian.apply(theta)
+    gradient = pull(residual) + rough
+    move = solve(-gradient)
+    cost = jnp.sum(residual**2) + jnp.sum(theta * rough)
+    return vertices, residual, move, -jnp.sum(gradient * move), cost
+
+
+@partial(jax.jit, static_argnames=("solver", "adjoint"))
+def _field_spread(problem, poses, prior, theta, solver, adjoint) -> Float[Array, "n"]:
+    """Return the standard deviations of log rigidity for noise of size 1, from samples.
+
+    ``H^-1 (J^T a + weight^(1/2) D^T root b)`` with normal a, b has the covariance H^-1.
+    """
+    *_, pull, solve = _linear_model(problem, poses, prior, theta, solver, adjoint)
+
+    def sample(key):
+        first, second = jax.random.split(key)
+        shape = poses.observed.shape
+        noise = jax.random.normal(first, shape, theta.dtype)
+        along = jax.random.normal(second, prior.root.shape, theta.dtype) * prior.root
+        i, j = prior.edges[:, 0], prior.edges[:, 1]
+        pulled = jnp.zeros_like(theta).at[i].add(along).at[j].add(-along)
+        return solve(pull(noise) + jnp.sqrt(prior.weight) * pulled)
+
+    samples = jax.lax.map(sample, jax.random.split(jax.random.key(0), _SAMPLES))
+    return jnp.sqrt(jnp.mean(samples**2, axis=0))
 
 
 # ---------------------------------------------------------------- which vertices were held
@@ -593,7 +844,7 @@ def estimate_rigidity_thesis(
 # ---------------------------------------------------------------- the search
 
 
-def _descend(evaluate, step, at, limit: int):
+def _descend(evaluate, step, at, limit: int, enough: float = 1e-10):
     """Gauss-Newton within a trust region; returns the best point and how it ended.
 
     optimistix's Levenberg-Marquardt and Dogleg begin with a full Gauss-Newton step and know no
@@ -605,7 +856,7 @@ def _descend(evaluate, step, at, limit: int):
             return at, _NOT_FINITE
         move, gain = step(at, radius)
         length = np.abs(move).max()
-        if length < 1e-9 or gain <= 1e-10 * at.cost:
+        if length < 1e-9 or gain <= enough * at.cost:
             return at, _CONVERGED
         new = evaluate(at.theta + move)
         if new.cost < at.cost:
