@@ -9,7 +9,11 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
-from jaxdeform.local_step import fit, polar_rotation
+from jaxdeform import local_step
+from jaxdeform.local_step import polar_rotation
+
+# Compiled once for each solver and number of cells; called plainly, every call compiles anew.
+fit = jax.jit(local_step.fit, static_argnums=0)
 
 
 def cells(strain, n=200, seed=0, flat=False):
