@@ -50,9 +50,8 @@ _BOUND_WIDTH = 0.05
 # Evaluations to fit the other parts anew, for one value of the part whose bounds are sought.
 _PROFILE_EVALUATIONS = 5
 # Of the bar's 438 handle coordinates about 40 move the rest by more than themselves.
-_MODES = 64
+_MODES = 32
 _PROBES = 8
-_FOR_NOISE = Implicit(tolerance=1e-5)
 # Conjugate gradients of one Gauss-Newton step of a field: it need not be exact.
 _CG_TOLERANCE, _CG_STEPS = 1e-2, 60
 # Standard deviations from so many samples are good to 12 %.
@@ -121,7 +120,7 @@ def estimate_rigidity(
     start: ArrayLike | None = None,
     solver: Alternating | QuasiNewton = Alternating(steps=100),  # noqa: B008 (frozen)
     adjoint: Unrolled | Implicit | None = None,
-    visible: float = 5e-3,
+    visible: float = 1e-2,
     max_evaluations: int = 50,
     progress: Callable[[int, float, np.ndarray], None] | None = None,
 ) -> Estimate:
@@ -204,7 +203,9 @@ def estimate_rigidity(
     at = counted(theta, modes)
     best, ending = _descend(partial(counted, modes=modes), step, at, max_evaluations - 1)
     if targets is None and ending.ok:
-        modes = np.asarray(_handle_modes(problem, poses, np.exp(best.theta)[label], solver))
+        modes = np.asarray(
+            _handle_modes(problem, poses, np.exp(best.theta)[label], solver, adjoint)
+        )
         at = _normal_equations(best.theta, best.vertices, best.jacobian, best.residual, modes)
         best, ending = _descend(
             partial(counted, modes=modes), step, at, max_evaluations - len(history)
@@ -214,7 +215,7 @@ def estimate_rigidity(
     freedom, meat = poses.count - count, best.normal
     if modes is not None:
         field = np.exp(best.theta)[label]
-        freedom, meat = _sandwich(problem, poses, field, best.jacobian, modes, solver)
+        freedom, meat = _sandwich(problem, poses, field, best.jacobian, modes, solver, adjoint)
     variance = max(best.cost / max(freedom, 1), floor)
     ridge = np.finfo(float).eps * (np.trace(best.normal) + floor)
     inverse = np.linalg.inv(best.normal + ridge * np.eye(count))
@@ -317,7 +318,7 @@ def _weigh(columns: Float[np.ndarray, "poses coordinates k"], modes) -> np.ndarr
     return columns - modes @ np.linalg.solve(inner, transposed @ columns)
 
 
-def _sandwich(problem, poses, field, jacobian, modes, solver) -> tuple[float, np.ndarray]:
+def _sandwich(problem, poses, field, jacobian, modes, solver, adjoint) -> tuple[float, np.ndarray]:
     """Return the degrees of freedom tr(W S) - p and J^T W S W J, with S = I + D D^T exactly.
 
     So the interval is right although the modes in W are few. The trace is Hutchinson's estimate.
@@ -329,7 +330,7 @@ def _sandwich(problem, poses, field, jacobian, modes, solver) -> tuple[float, np
     weighed = _weigh(flat, modes)
     rows = np.concatenate([weighed, flat[..., count:]], axis=-1)
     rows = np.moveaxis(rows, -1, 0).reshape(-1, *shape).astype(problem.dtype)
-    pulled = np.asarray(_pull_to_handles(problem, poses, field, rows, solver))
+    pulled = np.asarray(_pull_to_handles(problem, poses, field, rows, solver, adjoint))
     pulled = pulled.reshape(len(rows), -1)
     part, both, bare = np.split(pulled, [count, count + _PROBES])
     meat = np.einsum("pia,pib->ab", weighed[..., :count], weighed[..., :count]) + part @ part.T
@@ -361,19 +362,21 @@ def _residual(poses: _Poses, vertices) -> Float[Array, "poses n 3"]:
     return jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
 
 
-@partial(jax.jit, static_argnames="solver")
-def _pull_to_handles(problem, poses, field, rows, solver) -> Float[Array, "k poses h 3"]:
-    """Return D^T of each row; implicit, since it describes noise only."""
+@partial(jax.jit, static_argnames=("solver", "adjoint"))
+def _pull_to_handles(problem, poses, field, rows, solver, adjoint) -> Float[Array, "k poses h 3"]:
+    """Return D^T of each row."""
 
     def run(targets):
-        return _deformed(problem, targets, field, solver, _FOR_NOISE)
+        return _deformed(problem, targets, field, solver, adjoint)
 
     _, pull = jax.vjp(run, poses.targets)
     return jax.vmap(pull)(rows)[0]
 
 
-@partial(jax.jit, static_argnames="solver")
-def _handle_modes(problem, poses, field, solver) -> Float[Array, "poses coordinates modes"]:
+@partial(jax.jit, static_argnames=("solver", "adjoint"))
+def _handle_modes(
+    problem, poses, field, solver, adjoint
+) -> Float[Array, "poses coordinates modes"]:
     """Return U (per pose) with U U^T nearly D D^T, D = d vertices / d targets.
 
     A randomised range finder (Halko, Martinsson and Tropp 2011): D^T of random vectors spans the
@@ -383,11 +386,11 @@ def _handle_modes(problem, poses, field, solver) -> Float[Array, "poses coordina
 
     def modes(targets, counted):
         def run(targets):
-            vertices = deform(problem, targets, field, solver=solver, adjoint=_FOR_NOISE).vertices
+            vertices = deform(problem, targets, field, solver=solver, adjoint=adjoint).vertices
             return jnp.where(counted[:, None], vertices, 0.0)
 
-        vertices, push = jax.linearize(run, targets)
-        pull = jax.linear_transpose(push, targets)
+        vertices, pull = jax.vjp(run, targets)
+        push = lambda along: jax.jvp(run, (targets,), (along,))[1]  # noqa: E731
         probes = jax.random.normal(jax.random.key(0), (count, *vertices.shape), vertices.dtype)
         (rows,) = jax.vmap(pull)(probes)
         basis, _ = jnp.linalg.qr(rows.reshape(count, -1).T)

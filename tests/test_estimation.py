@@ -55,7 +55,7 @@ def test_one_rigidity_is_recovered_from_a_soft_start(bar_problem, pose_of, true)
 
 def test_two_materials_are_recovered_though_some_vertices_are_hidden(bar_problem, pose_of, halves):
     true = np.array([0.01, 30.0])
-    pose = pose_of(true[halves])
+    pose = np.array(pose_of(true[halves]))
     seen = np.ones(len(pose), bool)
     free = np.setdiff1d(np.arange(len(pose)), bar_problem.handles)
     seen[free[::7]] = False
@@ -141,14 +141,14 @@ def test_handle_noise_against_the_dense_covariance():
     )(jnp.asarray(targets))
     dense = np.asarray(dense).reshape(27, 12)
     covariance = np.eye(27) + dense @ dense.T
-    modes = np.asarray(_handle_modes(problem, poses, field, solver))
-    # The modes are solved for to five digits.
+    modes = np.asarray(_handle_modes(problem, poses, field, solver, jd.Implicit()))
+    # As exact as the deformation has converged.
     np.testing.assert_allclose(modes[0] @ modes[0].T, dense @ dense.T, atol=1e-4)
     columns = np.random.default_rng(0).standard_normal((1, 9, 3, 2)) * free[..., None, None]
     flat = columns.reshape(1, 27, 2)
     expected = np.linalg.solve(covariance, flat[0])
     np.testing.assert_allclose(_weigh(flat, modes)[0], expected, atol=1e-4)
-    freedom, meat = _sandwich(problem, poses, field, columns, modes, solver)
+    freedom, meat = _sandwich(problem, poses, field, columns, modes, solver, jd.Implicit())
     np.testing.assert_allclose(meat, flat[0].T @ expected, rtol=1e-3)
     # tr(W S) is the number of coordinates; Hutchinson's eight probes leave little here.
     assert abs(freedom + 2 - 3 * free.sum()) < 0.5
@@ -190,7 +190,7 @@ def test_handles_are_found_exactly(bar, bar_problem, pose_of):
 
 def test_handles_are_found_in_noise_and_in_several_poses(bar, bar_problem, pose_of):
     poses = np.stack([noisy(bar, pose_of(value), seed) for seed, value in enumerate((1.0, 30.0))])
-    with pytest.raises(jd.InputError, match="no handles found.*tolerance"):
+    with pytest.raises(jd.InputError, match="raise the tolerance"):
         jd.find_handles(bar, poses)
     found = jd.find_handles(bar, poses, tolerance=6 * NOISE)
     assert np.isin(bar_problem.handles, found).mean() > 0.98
