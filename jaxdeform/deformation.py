@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxdeform.energy import Rows, Scatter, cell_energy, scatter, stiffness
@@ -103,7 +104,7 @@ class Result(eqx.Module):
 
     def __str__(self) -> str:
         """Return what happened, as a sentence (one per lane for a batch)."""
-        if isinstance(self.code, jax.core.Tracer):
+        if isinstance(self.code, Tracer):
             return "(known once the compiled function has run)"
         codes = np.unique(np.asarray(self.code))
         if len(codes) == 1:
@@ -265,7 +266,7 @@ def precompute(
         b=jnp.asarray(b.T, kind),
         frames=jnp.asarray(frames.transpose(1, 2, 0), kind),
         scatter=scatter(cells, rest, frames, kind),
-        stiffness=Rows.build([matrix.tocsr()], kind),
+        stiffness=Rows.build([sp.csr_matrix(matrix)], kind),
         factor=factor,
         start=start,
         faces=jnp.asarray(mesh.faces, jnp.int32),
@@ -360,7 +361,7 @@ def deform(
         start = check_positions("start", start, (n, 3), dtype)
     held = _held(problem, targets, rigidity)
     solution = _solve(problem.system, held, start, local, solver, normals, adjoint)
-    if not isinstance(solution.vertices, jax.core.Tracer):
+    if not isinstance(solution.vertices, Tracer):
         # The host's factor lives as long as the problem; do not outrun it.
         jax.block_until_ready(solution)
     return solution
@@ -638,9 +639,12 @@ def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implici
 
     def solve(_residual, p):
         del _residual
-        method = _descend if isinstance(solver, QuasiNewton) else _alternate
         fixed_held = jax.lax.stop_gradient(held)
-        p, known, history, steps, code = method(system, fixed_held, p, evaluate, solver)
+        if isinstance(solver, QuasiNewton):
+            found = _descend(system, fixed_held, p, evaluate, solver)
+        else:
+            found = _alternate(system, fixed_held, p, evaluate, solver)
+        p, known, history, steps, code = found
         # As floats, because custom_root wants tangents of whatever it returns.
         counts = (steps.astype(p.dtype), code.astype(p.dtype))
         return jnp.where(system.free[None], p, 0.0), (known, history, *counts)

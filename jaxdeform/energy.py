@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
@@ -48,8 +49,8 @@ class Rows(eqx.Module):
     @staticmethod
     def build(matrices: list[sp.csr_matrix], dtype: np.dtype) -> "Rows":
         """Pack c matrices (n, n) into rows; the width is the one that stores the least."""
-        n = matrices[0].shape[0]
-        pattern = sum((abs(m) for m in matrices[1:]), start=abs(matrices[0])).tocsr()
+        n = len(matrices[0].indptr) - 1
+        pattern = sp.csr_matrix(sum((abs(m) for m in matrices[1:]), start=abs(matrices[0])))
         pattern.sort_indices()
         length = np.diff(pattern.indptr)
         widths = np.arange(1, min(WIDEST, max(1, length.max(initial=1))) + 1)
@@ -108,7 +109,7 @@ def _gather_sum(y: Float[Array, "... c n"], rows: Rows) -> Float[Array, "... n"]
             for s in range(index.shape[0])
         )
 
-    x = apply(rows.index, rows.coef)
+    x = jnp.asarray(apply(rows.index, rows.coef))
     if rows.more_row.shape[0]:
         x = x.at[..., rows.more_row].add(apply(rows.more_index, rows.more_coef))
     return x
@@ -143,7 +144,7 @@ def _register(primitive: Primitive, impl, transposed: Primitive) -> None:
     @primitive.def_abstract_eval
     def _abstract(x, *tables):
         out = jax.eval_shape(impl, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (x, *tables)))
-        return jax.core.ShapedArray(out.shape, out.dtype)
+        return ShapedArray(out.shape, out.dtype)
 
     mlir.register_lowering(primitive, mlir.lower_fun(impl, multiple_results=False))
 
@@ -156,7 +157,7 @@ def _register(primitive: Primitive, impl, transposed: Primitive) -> None:
         x, *tables = primals
         out = primitive.bind(x, *tables)
         if isinstance(tangents[0], ad.Zero):
-            return out, ad.Zero.from_primal_value(out)
+            return out, ad.Zero.from_primal_value(out)  # pyright: ignore[reportAttributeAccessIssue]
         return out, primitive.bind(tangents[0], *tables)
 
     def batch(args, axes):
@@ -209,7 +210,9 @@ def scatter(
     difference = difference_matrix(cells.edges, cells.n_vertices)
     member = cells.membership.astype(np.float64)
     plain = [(member @ sp.diags(cells.weights * edge[:, a]) @ difference).tocsr() for a in range(3)]
-    turned = [sum(sp.diags(frames[:, a, c]) @ plain[a] for a in range(3)).tocsr() for c in range(3)]
+    turned = [
+        sp.csr_matrix(sum(sp.diags(frames[:, a, c]) @ plain[a] for a in range(3))) for c in range(3)
+    ]
     return Scatter(Rows.build(turned, dtype), Rows.build([m.T.tocsr() for m in turned], dtype))
 
 

@@ -8,13 +8,14 @@ code that is compiled already.
 
 import itertools
 import weakref
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from cholespy import CholeskySolverD, CholeskySolverF, MatrixType
+from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Bool, Float, Int
 
 # Up to this many vertices the inverse is kept as a dense matrix (one product per solve, no call
@@ -70,7 +71,7 @@ class Anchor:
     handle set is no reason to compile again.
     """
 
-    def __init__(self, *factors: "_HostFactor | None") -> None:
+    def __init__(self, *factors: "HostFactor | None") -> None:
         """Hold on to the factors."""
         self._factors = factors
 
@@ -83,46 +84,51 @@ class Anchor:
         return hash(Anchor)
 
 
-class _HostFactor:
+class HostFactor:
     """Factors on first use, because the start's matrix is not needed by those who bring a start."""
 
     def __init__(self, matrix: sp.spmatrix, free: Bool[np.ndarray, "n"], dtype: np.dtype) -> None:
-        self.index = np.flatnonzero(free)
-        self.matrix: sp.csc_matrix | None = matrix[self.index][:, self.index].tocsc()
-        self.dtype = np.dtype(dtype)
-        self.solver = None
+        """Keep the free part of the matrix."""
+        self._index = np.flatnonzero(free)
+        self._matrix: sp.csr_matrix | None = _inner(matrix, self._index)
+        self._kind = CholeskySolverF if dtype == np.float32 else CholeskySolverD
+        self._solver: Any = None
 
-    def factorise(self) -> None:
-        if self.solver is not None or not len(self.index):
-            return
-        coo = self.matrix.tocoo()
-        kind = CholeskySolverF if self.dtype == np.float32 else CholeskySolverD
-        try:
-            self.solver = kind(
-                len(self.index),
-                coo.row.astype(np.int32),
-                coo.col.astype(np.int32),
-                coo.data.astype(np.float64),
-                MatrixType.COO,
-            )
-        except ValueError as error:
-            raise NotPositiveDefinite(str(error)) from error
-        self.matrix = None
+    def factorise(self):
+        """Return the factor of a matrix with at least one row, made at the first call."""
+        if self._matrix is not None:
+            entries = self._matrix.tocoo()
+            try:
+                self._solver = self._kind(
+                    len(self._index),
+                    entries.row.astype(np.int32),
+                    entries.col.astype(np.int32),
+                    entries.data.astype(np.float64),
+                    MatrixType.COO,
+                )
+            except ValueError as error:
+                raise NotPositiveDefinite(str(error)) from error
+            self._matrix = None
+        return self._solver
 
     def solve(self, right: np.ndarray) -> np.ndarray:
+        """Return the solution of all right-hand sides (..., n) together."""
         out = np.zeros(right.shape, right.dtype)
-        if not len(self.index):
+        if not len(self._index):
             return out
-        self.factorise()
         flat = right.reshape(-1, right.shape[-1])
-        b = np.ascontiguousarray(flat[:, self.index].T)
+        b = np.ascontiguousarray(flat[:, self._index].T)
         x = np.zeros_like(b)
-        self.solver.solve(b, x)
-        out.reshape(flat.shape)[:, self.index] = x.T
+        self.factorise().solve(b, x)
+        out.reshape(flat.shape)[:, self._index] = x.T
         return out
 
 
-_factors: "weakref.WeakValueDictionary[int, _HostFactor]" = weakref.WeakValueDictionary()
+def _inner(matrix: sp.spmatrix, index: np.ndarray) -> sp.csr_matrix:
+    return sp.csr_matrix(sp.csr_matrix(matrix)[index][:, index])
+
+
+_factors: "weakref.WeakValueDictionary[int, HostFactor]" = weakref.WeakValueDictionary()
 _numbers = itertools.count()
 
 
@@ -139,7 +145,7 @@ def _solve_on_host(number, right):
     return out
 
 
-def _lookup(number: int) -> _HostFactor:
+def _lookup(number: int) -> HostFactor:
     try:
         return _factors[number]
     except KeyError:
@@ -154,7 +160,7 @@ Factor = DenseFactor | SparseFactor
 
 def factorise(
     matrix: sp.spmatrix, free: Bool[np.ndarray, "n"], dtype: np.dtype, *, lazy: bool = False
-) -> tuple[Factor, "_HostFactor | None"]:
+) -> tuple[Factor, "HostFactor | None"]:
     """Return a factor of the free part of a symmetric positive definite matrix (n, n).
 
     With it comes what an :class:`Anchor` must hold, None for a dense factor.
@@ -168,7 +174,7 @@ def factorise(
         index = np.flatnonzero(free)
         inverse = np.zeros((n, n))
         if len(index):
-            block = matrix.tocsr()[index][:, index].toarray()
+            block = _inner(matrix, index).toarray()
             try:
                 lower = np.linalg.cholesky(block)
             except np.linalg.LinAlgError as error:
@@ -176,8 +182,8 @@ def factorise(
             half = np.linalg.solve(lower, np.eye(len(index)))
             inverse[np.ix_(index, index)] = half.T @ half
         return DenseFactor(jnp.asarray(inverse, dtype)), None
-    host = _HostFactor(matrix.tocsr(), free, dtype)
-    if not lazy:
+    host = HostFactor(matrix, free, np.dtype(dtype))
+    if not lazy and free.any():
         host.factorise()
     number = next(_numbers)
     _factors[number] = host

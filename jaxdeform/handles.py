@@ -5,10 +5,10 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.spatial.transform import Rotation
 
@@ -80,7 +80,7 @@ def check_components(mesh: Mesh, anchored: np.ndarray, referenced: np.ndarray) -
 
 def known(x) -> bool:
     """Return whether an array's values can be read now (they cannot while JAX traces)."""
-    return not isinstance(x, jax.core.Tracer)
+    return not isinstance(x, Tracer)
 
 
 def check_targets(targets: ArrayLike, count: int, dtype: np.dtype) -> Float[Array, "h 3"]:
@@ -105,7 +105,7 @@ def as_array(value, dtype: np.dtype, name: str) -> Array:
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError) as error:
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             raise
         raise InputError(f"{name} cannot be read as numbers: {error}") from error
 

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxdeform.energy import Rows
-from jaxdeform.global_step import Anchor, Factor, NotPositiveDefinite, factorise
+from jaxdeform.global_step import Anchor, Factor, HostFactor, NotPositiveDefinite, factorise
 from jaxdeform.handles import (
     check_components,
     check_handle_weights,
@@ -37,7 +37,7 @@ class LaplacianStart(eqx.Module):
 
 def laplacian_start(
     cells: Cells, free: Bool[np.ndarray, "n"], dtype: np.dtype
-) -> tuple[LaplacianStart, object]:
+) -> tuple[LaplacianStart, HostFactor | None]:
     """Set up the normal equations, and what keeps a large factor (made at first use) alive."""
     laplacian = normalised_laplacian(cells)
     normal = (laplacian.T @ laplacian).tocsr()
@@ -56,7 +56,7 @@ def normalised_laplacian(cells: Cells) -> sp.csr_matrix:
     for end in cells.edges.T:
         np.add.at(size, end, np.abs(cells.weights))
     total = np.maximum(laplacian.diagonal(), 1e-2 * size)
-    return (sp.diags(1.0 / np.where(total > 0, total, 1.0)) @ laplacian).tocsr()
+    return sp.csr_matrix(sp.diags(1.0 / np.where(total > 0, total, 1.0)) @ laplacian)
 
 
 class LaplacianEditor(eqx.Module):

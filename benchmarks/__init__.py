@@ -1,0 +1,1 @@
+"""Speed and memory against libigl, Open3D and the thesis's own way: ``python -m benchmarks``."""
