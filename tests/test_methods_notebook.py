@@ -8,8 +8,6 @@ NOTEBOOK = Path(__file__).parents[1] / "notebooks" / "methods.ipynb"
 
 
 @pytest.mark.slow
-# Jupyter's own: its kernels talk over plain TCP, and say so in a warning.
-@pytest.mark.filterwarnings("default")
 def test_the_notebook_runs():
     nbformat = pytest.importorskip("nbformat", reason="needs the notebook extra")
     nbclient = pytest.importorskip("nbclient", reason="needs the notebook extra")
