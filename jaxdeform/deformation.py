@@ -186,6 +186,8 @@ class _Held(NamedTuple):
     targets: Float[Array, "3 n"]
     """Target positions at handles, hard and soft; rest positions elsewhere."""
     rigidity: Float[Array, "n"]
+    soft: Float[Array, "n"]
+    """Weights of the soft handles; those of the system, which its factor holds, if not given."""
 
 
 # ---------------------------------------------------------------- precompute
@@ -310,6 +312,7 @@ def deform(
     local: LocalStep = Newton(),  # noqa: B008 (frozen)
     solver: Alternating | QuasiNewton | None = None,
     start: ArrayLike | None = None,
+    handle_weights: ArrayLike | None = None,
     normals: bool = False,
     adjoint: Unrolled | Implicit | None = None,
 ) -> Solution:
@@ -329,6 +332,9 @@ def deform(
     - solver: ``QuasiNewton()`` (default: to convergence) or ``Alternating(steps=100)`` (as in the
       thesis; the default with normals).
     - start: (n, 3) first guess; Laplacian editing (Sec. 4.1.2) if left out.
+    - handle_weights: other weights of the soft handles than in :func:`precompute`, a number or (h,),
+      0 or more and at most those (the factor stays, and bounds the energy from above then);
+      entries of hard handles are not read. Differentiable.
     - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
       (the only one of QuasiNewton).
@@ -359,7 +365,7 @@ def deform(
     rigidity = check_rigidity(rigidity, n, dtype)
     if start is not None:
         start = check_positions("start", start, (n, 3), dtype)
-    held = _held(problem, targets, rigidity)
+    held = _Held(_spread(problem, targets), rigidity, _soft(problem, handle_weights))
     solution = _solve(problem.system, held, start, local, solver, normals, adjoint)
     if not isinstance(solution.vertices, Tracer):
         # The host's factor lives as long as the problem; do not outrun it.
@@ -451,7 +457,7 @@ def _check_settings(solver, adjoint, normals: bool) -> None:
         )
 
 
-def _held(problem: Problem, targets: Array, rigidity: Array) -> _Held:
+def _spread(problem: Problem, targets: Array) -> Float[Array, "3 n"]:
     """Spread the targets over an array of all vertices, in NumPy where they are known.
 
     So the compiled code sees shapes that depend on the mesh alone: another number of handles does
@@ -461,10 +467,33 @@ def _held(problem: Problem, targets: Array, rigidity: Array) -> _Held:
         spread = np.array(problem.system.rest)
         center = np.asarray(problem.system.center)
         spread[:, problem.handles] = (np.asarray(targets) - center).T
-        return _Held(jnp.asarray(spread), rigidity)
+        return jnp.asarray(spread)
     moved = (targets - problem.system.center[None]).T
-    spread = problem.system.rest.at[:, problem.handles].set(moved)
-    return _Held(spread, rigidity)
+    return problem.system.rest.at[:, problem.handles].set(moved)
+
+
+def _soft(problem: Problem, weights: ArrayLike | None) -> Float[Array, "n"]:
+    """Spread the weights of soft handles over all vertices, 0 at hard ones and elsewhere."""
+    system = problem.system
+    if weights is None:
+        return system.soft
+    given = as_array(weights, problem.dtype, "handle_weights")
+    if given.shape not in ((), problem.handles.shape):
+        raise InputError(
+            f"handle_weights have shape {given.shape}: give one number or one per handle, "
+            f"{problem.handles.shape}"
+        )
+    given = jnp.broadcast_to(given, problem.handles.shape)
+    given = jnp.where(system.free[problem.handles], given, 0.0)
+    if known(given) and known(system.soft):
+        most = np.asarray(system.soft)[problem.handles]
+        bad = np.flatnonzero(~((np.asarray(given) >= 0) & (np.asarray(given) <= most)))
+        if bad.size:
+            raise InputError(
+                f"the weight of handle {problem.handles[bad[0]]} is {given[bad[0]]}: give 0 to "
+                f"{most[bad[0]]}, the weight that it had in precompute"
+            )
+    return jnp.zeros_like(system.soft).at[problem.handles].set(given)
 
 
 # ---------------------------------------------------------------- the iterations
@@ -490,11 +519,12 @@ def _evaluate(system: System, held: _Held, local: LocalStep, normals: bool, p, k
     else:
         t = run(c, system.b, held.rigidity)
         cell = cell_energy(t, c, system.b, held.rigidity)
-    stiff = system.stiffness.apply(p)
-    pull = system.scatter.adjoint(t) + system.soft[None] * held.targets
+    # The factor holds the system's own weights; others enter here only.
+    stiff = system.stiffness.apply(p) + (held.soft - system.soft)[None] * p
+    pull = system.scatter.adjoint(t) + held.soft[None] * held.targets
     scale = jnp.sum(p * stiff)
     # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
-    springs = jnp.sum(system.soft[None] * held.targets * (held.targets - 2.0 * p))
+    springs = jnp.sum(held.soft[None] * held.targets * (held.targets - 2.0 * p))
     gradient = jnp.where(system.free[None], stiff - pull, 0.0)
     return _State(t, gradient, scale + springs + jnp.sum(cell), scale)
 

@@ -218,3 +218,41 @@ def test_the_energy_answers_to_a_weight_by_the_squared_distance(sheet, mixed):
 def test_bad_handle_weights_get_a_clear_error(sheet, weights, message):
     with pytest.raises(jd.InputError, match=message):
         jd.precompute(sheet[0], [0, 1, 2], handle_weights=weights)
+
+
+@pytest.mark.parametrize(
+    ("solver", "local"),
+    [(TIGHT, jd.Newton()), (jd.Alternating(25), jd.RotationFit())],
+)
+def test_derivatives_to_the_weights_of_soft_handles(sheet, solver, local):
+    mesh, handles, targets = sheet
+    soft = mesh.vertices[handles, 0] > 3
+    problem = jd.precompute(mesh, handles, handle_weights=np.where(soft, 1.0, np.inf))
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(0.1, 0.9, len(handles))
+    goal, along = rng.normal(size=mesh.vertices.shape), weights * rng.normal(size=len(handles))
+
+    @jax.jit
+    def loss(w):
+        out = jd.deform(problem, targets, 0.3, handle_weights=w, solver=solver, local=local)
+        return jnp.sum(goal * out.vertices)
+
+    h = 1e-4
+    want = (loss(weights + h * along) - loss(weights - h * along)) / (2 * h)
+    gradient = jax.grad(loss)(jnp.asarray(weights))
+    np.testing.assert_allclose(jnp.sum(gradient * along), want, rtol=FD)
+    assert not np.any(gradient[~soft])  # a hard handle has no weight to change
+
+
+def test_other_weights_are_those_of_a_new_factorisation(sheet):
+    mesh, handles, targets = sheet
+    weights = np.random.default_rng(1).uniform(0.1, 0.9, len(handles))
+    loose = jd.precompute(mesh, handles, handle_weights=1.0)
+    anew = jd.precompute(mesh, handles, handle_weights=weights)
+    found = jd.deform(loose, targets, 0.3, handle_weights=weights, solver=TIGHT).vertices
+    want = jd.deform(anew, targets, 0.3, solver=TIGHT).vertices
+    np.testing.assert_allclose(found, want, atol=1e-6)
+    with pytest.raises(jd.InputError, match=r"the weight of handle \d+ is 2"):
+        jd.deform(loose, targets, 0.3, handle_weights=2.0)
+    with pytest.raises(jd.InputError, match="handle_weights have shape"):
+        jd.deform(loose, targets, 0.3, handle_weights=weights[:-1])
