@@ -138,13 +138,12 @@ def _adjoint_impl(y, *tables):
     return _gather_sum(y, _unflatten(tables)[1])
 
 
-def _register(primitive: Primitive, impl, transposed: Primitive) -> None:
+def _register(primitive: Primitive, impl, transposed: Primitive, shape) -> None:
     primitive.def_impl(partial(jax.jit(impl)))
 
     @primitive.def_abstract_eval
     def _abstract(x, *tables):
-        out = jax.eval_shape(impl, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (x, *tables)))
-        return ShapedArray(out.shape, out.dtype)
+        return ShapedArray(shape(x.shape, tables), x.dtype)
 
     mlir.register_lowering(primitive, mlir.lower_fun(impl, multiple_results=False))
 
@@ -172,8 +171,13 @@ def _register(primitive: Primitive, impl, transposed: Primitive) -> None:
     batching.primitive_batchers[primitive] = batch
 
 
-_register(_scatter_p, _scatter_impl, _adjoint_p)
-_register(_adjoint_p, _adjoint_impl, _scatter_p)
+_register(
+    _scatter_p,
+    _scatter_impl,
+    _adjoint_p,
+    lambda x, tables: (*x[:-1], tables[1].shape[0], x[-1]),
+)
+_register(_adjoint_p, _adjoint_impl, _scatter_p, lambda y, tables: (*y[:-2], y[-1]))
 
 
 class Scatter(eqx.Module):

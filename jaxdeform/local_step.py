@@ -253,13 +253,17 @@ def _tolerance(m: Grid, lam: Array) -> Array:
 def _on_few(solve, waiting: Bool[Array, "n"], size: int, x, *data: Array):
     """Replace x by ``solve(x, *data)`` in the cells that wait, ``size`` cells at a time.
 
-    Usually they are none, and the loop does not run. All arrays have the cells last.
+    Usually they are none, and nothing is run. All arrays have the cells last.
     """
     n = waiting.shape[0]
+    if size >= n:
+        put = lambda old, new: jnp.where(waiting, new, old)  # noqa: E731
+        run = lambda: jax.tree.map(put, x, solve(x, *data))  # noqa: E731
+        return jax.lax.cond(jnp.any(waiting), run, lambda: x)
 
     def advance(state):
         x, waiting = state
-        (chosen,) = jnp.nonzero(waiting, size=min(n, size), fill_value=n)
+        (chosen,) = jnp.nonzero(waiting, size=size, fill_value=n)
         pick = lambda v: v.at[..., chosen].get(mode="clip")  # noqa: E731
         put = lambda old, new: old.at[..., chosen].set(new, mode="drop")  # noqa: E731
         x = jax.tree.map(put, x, solve(*jax.tree.map(pick, (x, *data))))
@@ -448,7 +452,8 @@ def polar_rotation(c: Matrices) -> Matrices:
     size = jnp.max(jnp.abs(c), axis=(0, 1))
     c = c / jnp.where(size > 0, size, 1.0)[None, None]
     rotation, certain = _markley(c)
-    return _on_few(_svd_rotation, ~certain, 8 + c.shape[-1] // 64, rotation, c)
+    n = c.shape[-1]
+    return _on_few(_svd_rotation, ~certain, n if n <= SMALL else n // 64, rotation, c)
 
 
 def _markley(c: Matrices) -> tuple[Matrices, Bool[Array, "n"]]:

@@ -301,9 +301,9 @@ def rotate(
         [[0.0, 1.0, 0.0]]
     """
     points = _points(points)
-    center = points.mean(axis=0) if center is None else center
+    center = _centroid(points) if center is None else center
     middle = _array("center", center, points.dtype, (3,))
-    return _turn(points, degrees, _axis(axis), middle)
+    return _turn(points, _degrees(degrees, points), _axis(axis), middle)
 
 
 def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str = "y") -> Float[Array, "n 3"]:
@@ -319,9 +319,8 @@ def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str = "y") -> 
         (3, 3)
     """
     points = _points(points)
-    upper = _upper(points, along)
-    turned = _turn(points, degrees, _axis(along), points.mean(axis=0))
-    return jnp.where(upper[:, None], turned, points)
+    axis = _axis(along)
+    return _turn_upper(points, _degrees(degrees, points), axis, axis, _centroid(points))
 
 
 def bend(
@@ -343,11 +342,8 @@ def bend(
     points = _points(points)
     if along == toward:
         raise InputError(f"along and toward are both '{along}': a bar bends towards another axis")
-    upper = _upper(points, along)
     normal = np.cross(_axis(along), _axis(toward))
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    turned = _turn(points, degrees, normal, middle)
-    return jnp.where(upper[:, None], turned, points)
+    return _turn_upper(points, _degrees(degrees, points), _axis(along), normal, _middle(points))
 
 
 def _points(points: ArrayLike) -> Float[Array, "n 3"]:
@@ -378,18 +374,45 @@ def _axis(axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
     return vector / np.linalg.norm(vector)
 
 
-def _upper(points: Float[Array, "n 3"], along: str):
-    height = points @ jnp.asarray(_axis(along), points.dtype)
-    return height > (height.min() + height.max()) / 2
+def _degrees(degrees: ArrayLike, points: Float[Array, "n 3"]) -> Array:
+    return _array("degrees", degrees, points.dtype, ())
 
 
-def _turn(points, degrees, axis: np.ndarray, center) -> Float[Array, "n 3"]:
+# Compiled whole, because operation by operation a first bend takes 0.9 s instead of 0.2.
+
+
+@jax.jit
+def _centroid(points):
+    return points.mean(axis=0)
+
+
+@jax.jit
+def _middle(points):
+    return (points.min(axis=0) + points.max(axis=0)) / 2
+
+
+@jax.jit
+def _turn(points, degrees, axis, center) -> Float[Array, "n 3"]:
     """Rodrigues' formula."""
-    angle = jnp.deg2rad(_array("degrees", degrees, points.dtype, ()))
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    turn = (
-        jnp.eye(3, dtype=points.dtype)
-        + jnp.sin(angle) * jnp.asarray(cross, points.dtype)
-        + (1 - jnp.cos(angle)) * jnp.asarray(cross @ cross, points.dtype)
+    angle, axis = jnp.deg2rad(degrees), axis.astype(points.dtype)
+    zero = jnp.zeros_like(angle)
+    cross = jnp.stack(
+        [
+            jnp.stack(row)
+            for row in (
+                (zero, -axis[2], axis[1]),
+                (axis[2], zero, -axis[0]),
+                (-axis[1], axis[0], zero),
+            )
+        ]
     )
+    turn = jnp.eye(3, dtype=points.dtype) + jnp.sin(angle) * cross
+    turn = turn + (1 - jnp.cos(angle)) * (cross @ cross)
     return (points - center[None]) @ turn.T + center[None]
+
+
+@jax.jit
+def _turn_upper(points, degrees, along, axis, center) -> Float[Array, "n 3"]:
+    height = points @ along.astype(points.dtype)
+    upper = height > (height.min() + height.max()) / 2
+    return jnp.where(upper[:, None], _turn(points, degrees, axis, center), points)
