@@ -212,7 +212,7 @@ def thesis(quick: bool) -> list[Metric]:
     """The thesis's per-vertex gradient descent against ours, to the same energy."""
     loads = [(workloads.bar(), 1.0, 100)]
     if not quick:
-        loads.append((workloads.cylinder(), 0.05, 30))
+        loads.append((workloads.cylinder(), 0.05, 8))
     out = []
     for load, rigidity, steps in loads:
         problem = jd.precompute(load.mesh, load.handles)

@@ -282,6 +282,7 @@ def test_vmap_over_targets_rigidity_and_start(bar, bar_problem, bar_targets):
         assert relative(mixed[k], jd.deform(bar_problem, bar_targets, lam[k]).vertices) < 1e-6
 
 
+@pytest.mark.slow
 def test_sparse_factor_under_jit_vmap_grad():
     """Above 1000 vertices the factor is on the host: the same must hold there."""
     mesh = jd.shapes.cylinder()
