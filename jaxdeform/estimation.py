@@ -864,9 +864,10 @@ def estimate_rigidity_thesis(
 def _descend(evaluate, step, at, limit: int, enough: float = 1e-10):
     """Gauss-Newton within a trust region; returns the best point and how it ended.
 
-    optimistix's Levenberg-Marquardt and Dogleg know no bounds and keep no history. From 0.01 to 30 on
-    the bar both run off to where everything is rigid (1e46); with the residual divided by the
-    diagonal Levenberg-Marquardt arrives in 16 to 25 evaluations, where this takes 8 to 10.
+    optimistix's Levenberg-Marquardt and Dogleg know no bounds and keep no history. From 0.01 to 30
+    on the bar both run off to where everything is rigid (1e46); with the residual divided by the
+    diagonal Levenberg-Marquardt arrives in 16 to 25 evaluations, where this takes 8 to 10. In the
+    tests it is the peer.
     """
     radius = _STRIDE
     for _ in range(limit):

@@ -6,6 +6,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 from conftest import EXACT, FD, ends, real_mesh
 
@@ -96,6 +97,21 @@ def test_the_search_says_when_it_was_cut_short(bar_problem, pose_of):
     assert not fit.result.ok
     assert len(fit.history) == 2
     assert "max_evaluations" in str(fit.result)
+
+
+@pytest.mark.slow
+def test_optimistix_ends_at_the_same_minimum(bar, bar_problem, bar_targets, pose_of):
+    seen = noisy(bar, pose_of(1.0), seed=2)
+    fit = jd.estimate_rigidity(bar_problem, seen, targets=bar_targets)
+    free = np.flatnonzero(np.asarray(bar_problem.system.free))
+
+    def residual(theta, _):
+        out = jd.deform(bar_problem, bar_targets, jnp.exp(theta), solver=THESIS)
+        return (out.vertices[free] - seen[free]) / diagonal(bar)
+
+    peer = optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
+    found = optimistix.least_squares(residual, peer, jnp.asarray(0.0)).value
+    np.testing.assert_allclose(fit.rigidity[0], jnp.exp(found), rtol=1e-6)
 
 
 @pytest.mark.slow
