@@ -259,11 +259,12 @@ def _on_few(solve, waiting: Bool[Array, "n"], size: int, x, *data: Array):
     if size >= n:
         # A loop, since under vmap a cond would run for all lanes, always.
         put = lambda old, new: jnp.where(waiting, new, old)  # noqa: E731
-        again = lambda state: (
-            jax.tree.map(put, state[0], solve(state[0], *data)),
-            jnp.zeros((), bool),
-        )  # noqa: E731
-        return jax.lax.while_loop(lambda state: state[1], again, (x, jnp.any(waiting)))[0]
+
+        def once(state):
+            x, _ = state
+            return jax.tree.map(put, x, solve(x, *data)), jnp.zeros((), bool)
+
+        return jax.lax.while_loop(lambda state: state[1], once, (x, jnp.any(waiting)))[0]
 
     def advance(state):
         x, waiting = state
