@@ -92,8 +92,9 @@ def test_readme_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert blocks
+    names = {}  # a reader goes from one block to the next, and so do the names
     for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
+        exec(compile(block, "README.md", "exec"), names)
     assert jd.load_rigidity(tmp_path / "bent.ply").shape == (722,)
 
 
