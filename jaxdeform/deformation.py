@@ -565,11 +565,6 @@ def vertex_normals(positions: Float[Array, "3 n"], faces: Int[Array, "m 3"]) -> 
     return total / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
-def _fixed(system: System, held: _Held) -> Float[Array, "3 n"]:
-    """Positions of the vertices that are not free, 0 at the free ones."""
-    return jnp.where(system.free[None], 0.0, held.targets)
-
-
 @partial(jax.jit, static_argnames=("local", "solver", "normals", "adjoint"))
 def _solve(system, held, start, local, solver, normals, adjoint) -> Solution:
     if start is None:

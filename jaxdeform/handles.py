@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxdeform.mesh import InputError, Mesh
+from jaxdeform.shapes import rotation_matrices
 
 # ---------------------------------------------------------------- checks of the arguments
 
@@ -182,24 +183,6 @@ def check_groups(group: ArrayLike, count: int) -> Int[np.ndarray, "h"]:
     if bad.size:
         raise InputError(f"the group of handle {bad[0]} is {given[bad[0]]}: number them from 0")
     return given.astype(np.int64)
-
-
-def rotation_matrices(vector: Float[Array, "g 3"]) -> Float[Array, "g 3 3"]:
-    """Rodrigues' formula, with series at the zero angle so that derivatives exist there."""
-    square = jnp.sum(vector**2, axis=1)
-    small = square < 1e-8
-    safe = jnp.where(small, 1.0, square)
-    angle = jnp.sqrt(safe)
-    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
-    # 1 - cos by the half angle, which loses no digits.
-    cosine = jnp.where(small, 0.5 - square / 24.0, 2.0 * jnp.sin(angle / 2.0) ** 2 / safe)
-    x, y, z = vector[:, 0], vector[:, 1], vector[:, 2]
-    zero = jnp.zeros_like(x)
-    cross = jnp.stack(
-        [jnp.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], -2
-    )
-    eye = jnp.eye(3, dtype=vector.dtype)[None]
-    return eye + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross)
 
 
 # ---------------------------------------------------------------- files

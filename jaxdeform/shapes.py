@@ -346,6 +346,24 @@ def bend(
     return _turn_upper(points, _degrees(degrees, points), _axis(along), normal, _middle(points))
 
 
+def rotation_matrices(vector: Float[Array, "g 3"]) -> Float[Array, "g 3 3"]:
+    """Rodrigues' formula, with series at the zero angle so that derivatives exist there."""
+    square = jnp.sum(vector**2, axis=1)
+    small = square < 1e-8
+    safe = jnp.where(small, 1.0, square)
+    angle = jnp.sqrt(safe)
+    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    # 1 - cos by the half angle, which loses no digits.
+    cosine = jnp.where(small, 0.5 - square / 24.0, 2.0 * jnp.sin(angle / 2.0) ** 2 / safe)
+    x, y, z = vector[:, 0], vector[:, 1], vector[:, 2]
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack(
+        [jnp.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], -2
+    )
+    eye = jnp.eye(3, dtype=vector.dtype)[None]
+    return eye + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross)
+
+
 def _points(points: ArrayLike) -> Float[Array, "n 3"]:
     array = points if isinstance(points, jax.Array) else np.asarray(points)
     if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
@@ -393,21 +411,8 @@ def _middle(points):
 
 @jax.jit
 def _turn(points, degrees, axis, center) -> Float[Array, "n 3"]:
-    """Rodrigues' formula."""
-    angle, axis = jnp.deg2rad(degrees), axis.astype(points.dtype)
-    zero = jnp.zeros_like(angle)
-    cross = jnp.stack(
-        [
-            jnp.stack(row)
-            for row in (
-                (zero, -axis[2], axis[1]),
-                (axis[2], zero, -axis[0]),
-                (-axis[1], axis[0], zero),
-            )
-        ]
-    )
-    turn = jnp.eye(3, dtype=points.dtype) + jnp.sin(angle) * cross
-    turn = turn + (1 - jnp.cos(angle)) * (cross @ cross)
+    angle = jnp.deg2rad(degrees)
+    turn = rotation_matrices((angle * axis.astype(points.dtype))[None])[0]
     return (points - center[None]) @ turn.T + center[None]
 
 

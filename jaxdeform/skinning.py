@@ -23,9 +23,9 @@ from jaxdeform.handles import (
     check_handles,
     check_positions,
     known,
-    rotation_matrices,
 )
 from jaxdeform.mesh import InputError, Mesh
+from jaxdeform.shapes import rotation_matrices
 
 # How far a row of weights may be from one in sum, and R^T R of a rigid matrix from I: what single
 # precision and text files with six digits leave.
