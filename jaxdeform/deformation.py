@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxdeform.energy import Rows, Scatter, cell_energy, scatter, stiffness
+from jaxdeform.energy import Rows, Scatter, local_energy, scatter, stiffness
 from jaxdeform.global_step import Anchor, Factor, NotPositiveDefinite, factorise
 from jaxdeform.handles import (
     as_array,
@@ -28,6 +28,7 @@ from jaxdeform.laplacian_editing import LaplacianStart, laplacian_start
 from jaxdeform.local_step import LocalStep, Newton, fit
 from jaxdeform.mesh import InputError, Mesh
 from jaxdeform.neighborhood import Cells, moments, rings
+from jaxdeform.quasi_newton import QuasiNewton, Sample, has_converged, minimize
 
 # ---------------------------------------------------------------- what the caller chooses
 
@@ -43,23 +44,6 @@ class Alternating:
     """Number of iterations, or the most of them where a tolerance is given."""
     tolerance: float | None = None
     """Stop early once a step is expected to lower the energy by less than this part of it."""
-
-
-@dataclass(frozen=True)
-class QuasiNewton:
-    """L-BFGS on the reduced energy E(p') = min_T E(p', T), with A^-1 as initial inverse Hessian.
-
-    The first step is the alternating one, and so is any step after a refused one: a step that
-    would raise the energy is dropped with its history. An iteration costs what an alternating one
-    costs, and far fewer are needed: on the bar 41 where that needs 145 to come within 1e-4 of
-    the minimum, 72 where it needs 519 to 1e-9.
-    """
-
-    tolerance: float = 1e-8
-    """Stop once a plain step is expected to lower the energy by less than this part of it."""
-    max_steps: int = 500
-    memory: int = 6
-    """Number of past steps that shape the next one."""
 
 
 @dataclass(frozen=True)
@@ -395,7 +379,7 @@ def energy(
     lam = check_rigidity(rigidity, n, dtype)
     t = jnp.einsum("kai,ijk->ajk", t, system.frames)
     stiff = system.stiffness.apply(p) - system.soft[None] * p
-    return jnp.sum(p * stiff) + jnp.sum(cell_energy(t, system.scatter(p), system.b, lam))
+    return jnp.sum(p * stiff) + local_energy(t, system.scatter(p), system.b, lam)
 
 
 def material(problem: Problem, constant: ArrayLike) -> Float[Array, "n"]:
@@ -499,34 +483,25 @@ def _soft(problem: Problem, weights: ArrayLike | None) -> Float[Array, "n"]:
 # ---------------------------------------------------------------- the iterations
 
 
-class _State(NamedTuple):
-    """What one evaluation at p tells."""
-
-    transforms: Float[Array, "3 3 n"]
-    gradient: Float[Array, "3 n"]
-    """Half the gradient of the reduced energy, 0 at fixed vertices: A p - K^T T."""
-    energy: Float[Array, ""]
-    scale: Float[Array, ""]
-    """tr(p^T A p): what the energy is a small difference of, hence its rounding error."""
-
-
-def _evaluate(system: System, held: _Held, local: LocalStep, normals: bool, p, known=None):
+def _evaluate(system: System, held: _Held, p, known=None, *, local: LocalStep, normals: bool):
     """Evaluate at p; with ``known`` transformations the local step is not run again."""
     run = partial(fit, local) if known is None else partial(local.attach, known)
     c = system.scatter(p)
     if normals:
-        t, cell = _fit_with_normals(system, held, local, p, c, known)
+        t, cells = _fit_with_normals(system, held, local, p, c, known)
     else:
         t = run(c, system.b, held.rigidity)
-        cell = cell_energy(t, c, system.b, held.rigidity)
+        cells = local_energy(t, c, system.b, held.rigidity)
     # The factor holds the system's own weights; others enter here only.
     stiff = system.stiffness.apply(p) + (held.soft - system.soft)[None] * p
     pull = system.scatter.adjoint(t) + held.soft[None] * held.targets
-    scale = jnp.sum(p * stiff)
+    scale = jnp.vdot(p, stiff)
     # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
-    springs = jnp.sum(held.soft[None] * held.targets * (held.targets - 2.0 * p))
+    springs = jnp.vdot(held.soft[None] * held.targets, held.targets - 2.0 * p)
     gradient = jnp.where(system.free[None], stiff - pull, 0.0)
-    return _State(t, gradient, scale + springs + jnp.sum(cell), scale)
+    # The energy is a small difference of scale, hence its rounding error.
+    rounding = 20.0 * jnp.finfo(p.dtype).eps * jnp.abs(scale)
+    return Sample(t, gradient, scale + springs + cells, rounding)
 
 
 def _fit_with_normals(system: System, held: _Held, local: LocalStep, p, c, known):
@@ -550,8 +525,8 @@ def _fit_with_normals(system: System, held: _Held, local: LocalStep, p, c, known
     else:
         t = local.attach(jnp.einsum("cak,abk->cbk", known, turn), c, moments, held.rigidity)
     has_normal = jnp.sum(normal * normal, axis=0)
-    cell = cell_energy(t, c, moments, held.rigidity) + has_normal
-    return jnp.einsum("cbk,abk->cak", t, turn), cell
+    cells = local_energy(t, c, moments, held.rigidity) + jnp.sum(has_normal)
+    return jnp.einsum("cbk,abk->cak", t, turn), cells
 
 
 def vertex_normals(positions: Float[Array, "3 n"], faces: Int[Array, "m 3"]) -> Float[Array, "3 n"]:
@@ -607,7 +582,7 @@ def _alternate(system: System, held: _Held, p, evaluate, solver: Alternating):
         if solver.tolerance is None:
             done = last
         else:
-            done = last | _converged(gain, state.energy, _rounding(state), solver.tolerance)
+            done = last | has_converged(gain, state.energy, state.rounding, solver.tolerance)
         # A^-1 K^T T, written as a correction of p: it heals its own rounding.
         p = jnp.where(done, p, p - move)
         return p, state.transforms, state.energy, done
@@ -638,20 +613,6 @@ def _alternate(system: System, held: _Held, p, evaluate, solver: Alternating):
     return p, known, history, steps, jnp.asarray(code, jnp.int32)
 
 
-def _rounding(state: _State) -> Float[Array, ""]:
-    """Below this two energies differ by rounding: they are small differences of large sums."""
-    return 20.0 * jnp.finfo(state.scale.dtype).eps * jnp.abs(state.scale)
-
-
-def _converged(gain, energy, rounding, tolerance: float) -> Bool[Array, ""]:
-    """Whether a plain step is expected to gain less than the tolerance, or than can be computed.
-
-    The gain <g, A^-1 g> is a square, so it is known far more exactly than the energy itself.
-    """
-    eps = jnp.finfo(energy.dtype).eps
-    return gain <= tolerance * jnp.abs(energy) + 1e3 * eps * rounding
-
-
 def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implicit):
     """Solve by any method, and differentiate grad E(p) = 0 at the end (implicit function).
 
@@ -663,10 +624,10 @@ def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implici
     @jax.custom_jvp
     def root(system, held, p):
         if isinstance(solver, QuasiNewton):
-            found = _descend(system, held, p, evaluate, solver)
+            p, known, history, steps, converged = minimize(evaluate, system, held, p, solver)
+            code = jnp.where(converged, 1, 2)
         else:
-            found = _alternate(system, held, p, evaluate, solver)
-        p, known, history, steps, code = found
+            p, known, history, steps, code = _alternate(system, held, p, evaluate, solver)
         # As floats, because the tangents of integers are of a type of their own.
         return p, known, history, steps.astype(p.dtype), code.astype(p.dtype)
 
@@ -701,134 +662,3 @@ def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implici
 
     p, known, history, steps, code = root(system, held, jax.lax.stop_gradient(p))
     return p, known, history, steps.astype(jnp.int32), code.astype(jnp.int32)
-
-
-class _Memory(NamedTuple):
-    """The last steps of L-BFGS, as a ring of slots; rho = 0 marks an empty one.
-
-    Kept are s (steps) and z = A^-1 y (y: change of gradient), and all products that the two-loop
-    recursion needs as small matrices, so that a direction costs two passes over each.
-    """
-
-    s: Float[Array, "m 3 n"]
-    z: Float[Array, "m 3 n"]
-    rho: Float[Array, "m"]
-    sy: Float[Array, "m m"]
-    yzy: Float[Array, "m m"]
-    head: Int[Array, ""]
-
-
-class _Point(NamedTuple):
-    """An accepted position and what was evaluated there."""
-
-    p: Float[Array, "3 n"]
-    transforms: Float[Array, "3 3 n"]
-    gradient: Float[Array, "3 n"]
-    z: Float[Array, "3 n"]
-    """A^-1 gradient: the plain step, negated."""
-    energy: Float[Array, ""]
-    rounding: Float[Array, ""]
-
-
-def _descend(system: System, held: _Held, p, evaluate, solver: QuasiNewton):
-    """L-BFGS preconditioned by A (see QuasiNewton)."""
-    m, dtype = solver.memory, p.dtype
-    zero = jnp.zeros_like(p)
-    empty = _Memory(
-        s=jnp.zeros((m, *p.shape), dtype),
-        z=jnp.zeros((m, *p.shape), dtype),
-        rho=jnp.zeros(m, dtype),
-        sy=jnp.zeros((m, m), dtype),
-        yzy=jnp.zeros((m, m), dtype),
-        head=jnp.asarray(0, jnp.int32),
-    )
-
-    def converged(at: _Point):
-        gain = jnp.sum(at.gradient * at.z)
-        return _converged(gain, at.energy, at.rounding, solver.tolerance)
-
-    def unfinished(carry):
-        turn, at, _, _, stalled = carry
-        running = (turn <= solver.max_steps) & ~stalled & ~converged(at)
-        return (turn == 0) | (running & jnp.isfinite(at.energy))
-
-    def advance(carry):
-        turn, at, memory, history, _ = carry
-        sg, zg = _products(memory, at.gradient)
-        # The first turn evaluates the start: its step is zero, its old energy infinite. (So the
-        # local step is compiled once.)
-        step = _direction(memory, at.z, sg, zg)
-        state = evaluate(system, held, p=at.p + step)
-        new = _Point(
-            at.p + step,
-            state.transforms,
-            state.gradient,
-            system.factor.solve(state.gradient),
-            state.energy,
-            _rounding(state),
-        )
-        good = (new.energy <= at.energy + at.rounding) | (turn == 0)
-        # A refused step costs its evaluation and the memory; the plain step that follows cannot
-        # raise the energy, so a second refusal in a row is rounding.
-        stalled = ~good & jnp.all(memory.rho == 0.0)
-        memory = _remember(memory, good, step, at, new, sg, zg)
-        at = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, at)
-        return turn + 1, at, memory, history.at[turn].set(at.energy), stalled
-
-    begin = _Point(p, jnp.zeros((3, *p.shape), dtype), zero, zero, jnp.inf + zero[0, 0], zero[0, 0])
-    history = jnp.zeros(solver.max_steps + 1, dtype)
-    carry = (jnp.asarray(0, jnp.int32), begin, empty, history, jnp.asarray(False))
-    turn, at, _, history, stalled = jax.lax.while_loop(unfinished, advance, carry)
-    code = jnp.where(stalled | converged(at), 1, 2).astype(jnp.int32)
-    return at.p, at.transforms, history, turn - 1, code
-
-
-def _products(memory: _Memory, g) -> tuple[Float[Array, "m"], Float[Array, "m"]]:
-    return jnp.einsum("mak,ak->m", memory.s, g), jnp.einsum("mak,ak->m", memory.z, g)
-
-
-def _direction(memory: _Memory, z, sg, zg) -> Float[Array, "3 n"]:
-    """The two-loop recursion (Nocedal 1980) on the coefficients of s and z.
-
-    From the newest step to the oldest and back: two triangular systems with the matrix s_i . y_j.
-    """
-    m = memory.rho.shape[0]
-    newest_first = (memory.head - 1 - jnp.arange(m, dtype=jnp.int32)) % m
-    pick = lambda x: x[newest_first]  # noqa: E731
-    filled = pick(memory.rho) > 0
-    sy = jnp.where(filled[:, None] & filled[None], pick(pick(memory.sy).T).T, 0.0)
-    diagonal = jnp.where(filled, jnp.diag(sy), 1.0)
-    lower = jnp.tril(sy, -1) + jnp.diag(diagonal)
-    solve = partial(jax.scipy.linalg.solve_triangular, lower, lower=True)
-    alpha = solve(jnp.where(filled, pick(sg), 0.0))
-    bent = pick(pick(memory.yzy).T).T @ alpha - pick(zg)
-    gamma = solve(jnp.where(filled, diagonal * alpha + bent, 0.0), trans=1)
-    alpha, gamma = (jnp.zeros_like(x).at[newest_first].set(x) for x in (alpha, gamma))
-    back = jnp.einsum("m,mak->ak", alpha, memory.z) - jnp.einsum("m,mak->ak", gamma, memory.s)
-    return back - z
-
-
-def _remember(memory: _Memory, good, step, old: _Point, new: _Point, sg, zg) -> _Memory:
-    """Put a good step into the oldest slot, if the curvature along it is positive; else forget."""
-    sg_new, zg_new = _products(memory, new.gradient)
-    dz = new.z - old.z
-    y = new.gradient - old.gradient
-    sy, yzy = jnp.sum(step * y), jnp.sum(y * dz)
-    i = memory.head
-    kept = good & (sy > 1e-10 * yzy)
-    row = jnp.arange(memory.rho.shape[0], dtype=i.dtype) == i
-    # Row and column i of the two matrices; s_i . y_j is kept for older s only.
-    column = jnp.where(row, sy, sg_new - sg)[:, None]
-    square = jnp.where(row, yzy, zg_new - zg)
-    matrix_sy = jnp.where(row[None], column, jnp.where(row[:, None], 0.0, memory.sy))
-    matrix_yzy = jnp.where(row[:, None], square[None], memory.yzy)
-    matrix_yzy = jnp.where(row[None], square[:, None], matrix_yzy)
-    rho = jnp.where(row, 1.0 / jnp.where(kept, sy, 1.0), memory.rho)
-    return _Memory(
-        s=memory.s.at[i].set(jnp.where(kept, step, memory.s[i])),
-        z=memory.z.at[i].set(jnp.where(kept, dz, memory.z[i])),
-        rho=jnp.where(kept, rho, jnp.where(good, memory.rho, 0.0)),
-        sy=jnp.where(kept, matrix_sy, memory.sy),
-        yzy=jnp.where(kept, matrix_yzy, memory.yzy),
-        head=jnp.where(kept, (i + 1) % memory.rho.shape[0], i),
-    )

@@ -226,18 +226,21 @@ def stiffness(cells: Cells) -> sp.csc_matrix:
     return (difference.T @ sp.diags(cells.overlap * cells.weights) @ difference).tocsc()
 
 
-def cell_energy(
+def local_energy(
     transforms: Float[Array, "3 3 n"],
     c: Float[Array, "3 3 n"],
     b: Float[Array, "3 n"],
     rigidity: Float[Array, "n"],
-) -> Float[Array, "n"]:
-    """Return ``lambda |T^T T - I|^2 + tr(T B T^T) - 2 tr(T C)`` of each cell, in its frame."""
+) -> Float[Array, ""]:
+    """Return the sum over all cells of ``lambda |T^T T - I|^2 + tr(T B T^T) - 2 tr(T C)``."""
     gram = [[_dot(transforms[:, i], transforms[:, j]) for j in range(i + 1)] for i in range(3)]
     stretch = sum((gram[i][i] - 1.0) ** 2 for i in range(3))
     shear = sum(gram[i][j] ** 2 for i in range(3) for j in range(i))
     data = sum(b[i] * gram[i][i] - 2.0 * _dot(transforms[:, i], c[i]) for i in range(3))
-    return rigidity * (stretch + 2.0 * shear) + data
+    cells = rigidity * (stretch + 2.0 * shear) + data
+    # A choice that changes nothing, but that XLA does not take into the sum: there a single thread
+    # would work out all cells (0.8 instead of 0.2 ms for 51,200).
+    return jnp.sum(jnp.where(jnp.isnan(cells), jnp.nan, cells))
 
 
 def _dot(u: Float[Array, "3 n"], v: Float[Array, "3 n"]) -> Float[Array, "n"]:

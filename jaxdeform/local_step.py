@@ -273,7 +273,7 @@ def _tolerance(m: Grid, lam: Array) -> Array:
     return (4e-10 + 100.0 * eps) * (lam + _norm(m)) + jnp.finfo(lam.dtype).tiny
 
 
-def _on_few(solve, waiting: Bool[Array, "n"], size: int, x, *data: Array):
+def _on_few(solve, waiting: Bool[Array, "n"], size: int, x, *data):
     """Replace x by ``solve(x, *data)`` in the cells that wait, ``size`` cells at a time.
 
     Usually they are none, and nothing is run. All arrays have the cells last.
@@ -536,7 +536,7 @@ def _markley(c: Grid) -> tuple[Grid, Bool[Array, "n"]]:
     a = _transpose(c)
     eps = jnp.finfo(a[0][0].dtype).eps
     cofactor = [_cross(a[1], a[2]), _cross(a[2], a[0]), _cross(a[0], a[1])]
-    square = sum(_inner(row, row) for row in a)
+    square = jnp.asarray(sum(_inner(row, row) for row in a))
     det = _inner(a[0], cofactor[0])
     area = sum(_inner(row, row) for row in cofactor)
 
