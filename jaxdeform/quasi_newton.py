@@ -130,6 +130,8 @@ class _Slots(NamedTuple):
     at: Sample
     z: Float[Array, "w 3 n"]
     """A^-1 gradient: the plain step, negated."""
+    gain: Float[Array, "w"]
+    """<gradient, z>: twice what a plain step is expected to gain."""
     turn: Int[Array, "w"]
     """Evaluations done."""
     history: Float[Array, "w history"]
@@ -186,7 +188,7 @@ def _empty(p: Float[Array, "w 3 n"], settings: QuasiNewton) -> _Slots:
         zeros(m, *shape), zeros(m, *shape), filled, zeros(*small), zeros(*small), zeros(m), zeros(m)
     )
     turn, history = jnp.zeros(w, jnp.int32), zeros(settings.max_steps + 1)
-    return _Slots(p, at, zeros(*shape), turn, history, memory, jnp.zeros(w, bool))
+    return _Slots(p, at, zeros(*shape), zeros(), turn, history, memory, jnp.zeros(w, bool))
 
 
 def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 n"]) -> _Slots:
@@ -203,8 +205,7 @@ def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 n"]) ->
 
 
 def _converged(work: _Slots, settings: QuasiNewton) -> Bool[Array, "w"]:
-    gain = _inner(work.at.gradient, work.z)
-    return has_converged(gain, work.at.energy, work.at.rounding, settings.tolerance)
+    return has_converged(work.gain, work.at.energy, work.at.rounding, settings.tolerance)
 
 
 def _done(work: _Slots, settings: QuasiNewton) -> Bool[Array, "w"]:
@@ -228,13 +229,18 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     # A refused step costs its evaluation and the memory; the plain step that follows cannot raise
     # the energy, so a second refusal in a row is rounding.
     stalled = work.stalled | (~good & ~jnp.any(work.memory.filled, axis=1))
-    memory = _remember(work.memory, tick, good, step, work, new.gradient, z)
+    dz, y = z - work.z, new.gradient - work.at.gradient
+    # All inner products of a turn that are not with the memory, as one batched product.
+    left, right = jnp.stack([step, dz, z], axis=1), jnp.stack([y, new.gradient], axis=1)
+    products = jnp.einsum("wiak,wjak->wij", left, right)
+    kept = good & ~first
+    memory = _remember(work.memory, tick, kept, good, step, dz, new.gradient, products)
     keep = lambda new, old: jnp.where(good.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
     at = jax.tree.map(keep, new, work.at)
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
     history = work.history.at[slot, work.turn].set(at.energy, mode="drop")
-    p, z = keep(p, work.p), keep(z, work.z)
-    return tick + 1, _Slots(p, at, z, work.turn + 1, history, memory, stalled)
+    p, z, gain = keep(p, work.p), keep(z, work.z), keep(products[:, 2, 1], work.gain)
+    return tick + 1, _Slots(p, at, z, gain, work.turn + 1, history, memory, stalled)
 
 
 def _apart(always: Bool[Array, ""], function, *arguments):
@@ -271,14 +277,16 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 n"]:
     return back - jnp.einsum("wm,wmak->wak", gamma, memory.s) - z
 
 
-def _remember(memory: _Memory, tick, good, step, old: _Slots, g, z) -> _Memory:
-    """Put good steps into the oldest slot, if the curvature along them is positive; else forget."""
+def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
+    """Put new steps into the oldest slot, if the curvature along them is positive.
+
+    A lane whose step was not good forgets all.
+    """
     m = memory.filled.shape[1]
     age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
-    dz, y = z - old.z, g - old.at.gradient
-    sy, yzy = _inner(step, y), _inner(y, dz)
+    sy, yzy = products[:, 0, 0], products[:, 1, 0]
     # (NaN fails the comparison; so nothing that is not finite ever comes in.)
-    kept = good & (old.turn > 0) & (sy > 1e-10 * yzy) & jnp.isfinite(yzy)
+    kept = new & (sy > 1e-10 * yzy) & jnp.isfinite(yzy)
     sg = jnp.einsum("wmak,wak->wm", memory.s, g)[:, age]
     zg = jnp.einsum("wmak,wak->wm", memory.z, g)[:, age]
     column, square = sg - memory.sg, zg - memory.zg
@@ -297,10 +305,6 @@ def _remember(memory: _Memory, tick, good, step, old: _Slots, g, z) -> _Memory:
         filled=append(memory.filled & good[:, None], kept),
         sy=later(memory.sy, jnp.zeros_like(column), column, sy),
         yzy=later(memory.yzy, square, square, yzy),
-        sg=append(sg, _inner(step, g)),
-        zg=append(zg, _inner(dz, g)),
+        sg=append(sg, products[:, 0, 1]),
+        zg=append(zg, products[:, 1, 1]),
     )
-
-
-def _inner(u: Float[Array, "w 3 n"], v: Float[Array, "w 3 n"]) -> Float[Array, "w"]:
-    return jnp.einsum("wak,wak->w", u, v)
