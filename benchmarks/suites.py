@@ -481,6 +481,26 @@ assert float(out.energy[-1]) < float(out.energy[0])
 """
 
 
+_GRADIENT = """
+import json
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import jaxdeform as jd
+from benchmarks import workloads
+load = workloads.tube(20_000)
+problem = jd.precompute(load.mesh, load.handles)
+base = jd.material(problem, 0.2)
+solver, adjoint = jd.Alternating({steps}), jd.{adjoint}()
+def loss(s):
+    out = jd.deform(problem, load.targets, s * base, solver=solver, adjoint=adjoint,
+                    start=load.mesh.vertices)
+    return jnp.sum(out.vertices ** 2)
+value, slope = jax.jit(jax.value_and_grad(loss))(1.0)
+assert bool(jnp.isfinite(slope))
+"""
+
+
 @suite
 def memory(quick: bool) -> list[Metric]:
     """Peak resident memory of a process that does one thing."""
@@ -498,6 +518,14 @@ def memory(quick: bool) -> list[Metric]:
             Metric("precomputation", name, found[0], "s"),
             Metric(f"{steps} steps, compilation included", name, found[1], "s"),
         ]
+    for adjoint, target in (("Implicit", 1.05), ("Unrolled", None)):
+        few, many = (
+            child(_GRADIENT.format(steps=steps, adjoint=adjoint) + harness.PEAK + "print(peak_gib)")
+            for steps in (50, 400)
+        )
+        name = f"peak memory of value and gradient, {adjoint}, 400 steps / 50 steps"
+        out.append(Metric(name, "tube, 20,000 vertices", many / few, "1", target))
+        out.append(Metric(f"peak memory, {adjoint}, 400 steps", "tube", many, "GiB"))
     return out
 
 
