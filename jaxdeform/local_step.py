@@ -66,13 +66,13 @@ def _over_lanes(local: LocalStep):
 
     @minimize.def_vmap
     def rule(lanes, batched, *data):
-        data = [
-            x if is_ else jnp.broadcast_to(x, (lanes, *x.shape))
+        n = data[0].shape[-1]
+        spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (lanes, *x.shape))  # noqa: E731
+        flat = [
+            jnp.moveaxis(spread(x, is_), 0, -2).reshape(*x.shape[is_:-1], lanes * n)
             for x, is_ in zip(data, batched, strict=True)
         ]
-        flat = [jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1) for x in data]
-        t = minimize(*flat)
-        return jnp.moveaxis(t.reshape(3, 3, lanes, -1), -2, 0), True
+        return jnp.moveaxis(minimize(*flat).reshape(3, 3, lanes, n), -2, 0), True
 
     return minimize
 

@@ -94,8 +94,9 @@ def minimize(
             raise NotImplementedError("vmap over problems: they differ in structure; loop instead")
         spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
         own = jax.tree.map(spread, own, tuple(batched[1:]))
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), own)
-        out = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), lanes(system, *flat))
+        each = own[-1].shape[1]
+        flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
+        out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), lanes(system, *flat))
         return out, jax.tree.map(lambda _: True, out)
 
     one = jax.tree.map(lambda x: x[None], (held, start))

@@ -307,6 +307,7 @@ def test_queue_of_lanes_is_every_lane_alone(bar, bar_problem, bar_targets):
         steps = int(got.steps[k])
         np.testing.assert_array_equal(energy[steps:], energy[-1])
         assert np.all(np.diff(energy) <= 1e-9 * np.abs(energy[:-1]))
+    assert jax.vmap(one)(jnp.zeros(0)).vertices.shape == (0, *bar.vertices.shape)
     nested = jax.jit(jax.vmap(jax.vmap(one)))(jnp.asarray(lam[:6]).reshape(2, 3))
     np.testing.assert_allclose(
         nested.vertices.reshape(6, *bar.vertices.shape), got.vertices[:6], atol=1e-4
