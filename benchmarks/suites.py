@@ -482,7 +482,6 @@ assert float(out.energy[-1]) < float(out.energy[0])
 
 
 _GRADIENT = """
-import json
 import jax
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp

@@ -5,10 +5,11 @@ where B is diagonal; energy.py),
 
     phi(T) = lambda |T^T T - I|^2 + tr(T B T^T) - 2 tr(T C).
 
-The problem has several minima. All solvers start from the proper polar rotation R of C^T, so T is
-a function of p' alone and p'(lambda) is smooth: warm-starting T from the last iteration makes that
-curve noisy (4e-4) and wrong at large lambda; starting from the identity sticks at a bend of 90
-degrees; starting from the affine fit gives inverted cells.
+The problem has several minima. All solvers start from the proper polar rotation R of C^T
+(``Newton`` one cheap step beyond it), so T is a function of p' alone and p'(lambda) is smooth:
+warm-starting T from the last iteration makes that curve noisy (4e-4) and wrong at large lambda;
+starting from the identity sticks at a bend of 90 degrees; starting from the affine fit gives
+inverted cells.
 
 ``Newton`` is the default because it is the fastest that reaches the minimum. It is measured
 against the alternatives in docs/benchmarks.md.

@@ -143,12 +143,10 @@ class _Slots(NamedTuple):
 def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
     count = start.shape[0]
     slots = min(count, SLOTS)
-    zero = jnp.zeros_like(start)
-    history = jnp.zeros((count, settings.max_steps + 1), start.dtype)
     out = Descent(
-        zero,
+        jnp.zeros_like(start),
         jnp.zeros((count, 3, *start.shape[1:]), start.dtype),
-        history,
+        jnp.zeros((count, settings.max_steps + 1), start.dtype),
         jnp.zeros(count, jnp.int32),
         jnp.zeros(count, bool),
     )
@@ -234,8 +232,7 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     # All inner products of a turn that are not with the memory, as one batched product.
     left, right = jnp.stack([step, dz, z], axis=1), jnp.stack([y, new.gradient], axis=1)
     products = jnp.einsum("wiak,wjak->wij", left, right)
-    kept = good & ~first
-    memory = _remember(work.memory, tick, kept, good, step, dz, new.gradient, products)
+    memory = _remember(work.memory, tick, good & ~first, good, step, dz, new.gradient, products)
     keep = lambda new, old: jnp.where(good.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
     at = jax.tree.map(keep, new, work.at)
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
