@@ -271,14 +271,21 @@ def local_steps(quick: bool) -> list[Metric]:
 
 @suite
 def factors(quick: bool) -> list[Metric]:
-    """What may solve the global step, by size; dense and CHOLMOD cross where DENSE_BELOW says."""
+    """What may solve the global step, by size, for one deformation and for 32 together.
+
+    Dense and CHOLMOD cross where DENSE_BELOW says. Nested dissection is for accelerators; here it
+    is timed on whatever JAX runs on.
+    """
     import igl
     import scipy.sparse.linalg
 
     from jaxdeform import global_step
     from jaxdeform.energy import stiffness
+    from jaxdeform.global_step import factorise
+    from jaxdeform.nested_dissection import dissected_factor
 
-    out = []
+    out, double = [], np.dtype(float)
+    solve = jax.jit(lambda factor, b: factor.solve(b))
     for size in (500, 1000, 2000, 5000) if quick else (500, 1000, 2000, 5000, 50_000, 200_000):
         load = workloads.tube(size)
         n = load.mesh.n_vertices
@@ -287,36 +294,44 @@ def factors(quick: bool) -> list[Metric]:
         free[load.handles] = False
         inner = matrix[free][:, free].tocsc()
         lu = scipy.sparse.linalg.splu(inner)
-        right = np.random.default_rng(0).normal(size=(n, 3))
-        columns = jnp.asarray(right.T)
-        empty, none = np.zeros((0, 3)), igl.min_quad_with_fixed_data()
+        peer = igl.min_quad_with_fixed_data()
         igl.min_quad_with_fixed_precompute(
-            inner, np.zeros(0, np.int64), scipy.sparse.csc_matrix((0, len(right[free]))), True, none
+            inner,
+            np.zeros(0, np.int64),
+            scipy.sparse.csc_matrix((0, inner.shape[0])),
+            True,
+            peer,
         )
-        zeros = np.zeros((0, 3))
-        kept = []
-
-        def solver(dense: bool, matrix=matrix, free=free, n=n, columns=columns, kept=kept):
-            limit, global_step.DENSE_BELOW = global_step.DENSE_BELOW, n if dense else 0
-            try:
-                factor, held = global_step.factorise(matrix, free, np.dtype(float))
-            finally:
-                global_step.DENSE_BELOW = limit
-            kept.append(held)
-            solve = jax.jit(lambda factor, b: factor.solve(b))
-            return lambda: jax.block_until_ready(solve(factor, columns))
-
-        runs = {
-            "CHOLMOD through cholespy": solver(False),
-            "SuperLU through SciPy": lambda lu=lu, b=right[free]: lu.solve(b),
-            "libigl": lambda none=none, b=right[free], zeros=zeros, empty=empty: (
-                igl.min_quad_with_fixed_solve(none, -b, zeros, empty)
-            ),
+        positions, limit = load.mesh.vertices, global_step.DENSE_BELOW
+        ours: dict[str, tuple[global_step.Factor, object]] = {
+            "nested dissection": (dissected_factor(matrix, free, positions, double), None)
         }
-        if n <= 5200:
-            runs["dense inverse"] = solver(True)
-        for name, value in interleaved(runs, 5).items():
-            out.append(Metric(f"one solve, {name}", load.name, 1e3 * value, "ms"))
+        try:
+            for name, global_step.DENSE_BELOW in (("CHOLMOD", 0), ("dense inverse", 5200)):
+                if name == "CHOLMOD" or n <= 5200:
+                    ours[name] = factorise(matrix, free, double, positions=positions)
+        finally:
+            global_step.DENSE_BELOW = limit
+        for lanes in (1, 32):
+            right = np.random.default_rng(0).normal(size=(3 * lanes, n))
+            right[:, ~free] = 0.0
+            columns, b = jnp.asarray(right), np.ascontiguousarray(right[:, free].T)
+            zeros = np.zeros((0, 3 * lanes))
+            runs: dict[str, Callable[[], object]] = {
+                name: lambda factor=factor, columns=columns: jax.block_until_ready(
+                    solve(factor, columns)
+                )
+                for name, (factor, _) in ours.items()
+            }
+            runs["SuperLU through SciPy"] = lambda lu=lu, b=b: lu.solve(b)
+            runs["libigl"] = lambda peer=peer, b=b, zeros=zeros: igl.min_quad_with_fixed_solve(
+                peer, -b, zeros, zeros
+            )
+            far = [np.abs(np.asarray(run())).max() for run in runs.values()]
+            assert np.ptp(far) < 1e-9 * max(far), "the solvers disagree"
+            for name, value in interleaved(runs, 5).items():
+                label = f"one solve of {3 * lanes} columns, {name}"
+                out.append(Metric(label, load.name, 1e3 * value, "ms"))
     return out
 
 

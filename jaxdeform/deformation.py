@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxdeform.energy import Rows, Scatter, local_energy, scatter, stiffness
+from jaxdeform.energy import Rows, Scatter, local_energy, scatter, stiffness, total
 from jaxdeform.global_step import Anchor, Factor, NotPositiveDefinite, factorise
 from jaxdeform.handles import (
     as_array,
@@ -239,9 +239,9 @@ def precompute(
     finite = np.isfinite(pull)
     soft[index[finite]] = pull[finite]
 
-    cells, matrix, factor, held = _factorise(cells, free, soft, kind)
     center = mesh.vertices[referenced].mean(axis=0)
     rest = mesh.vertices - center
+    cells, matrix, factor, held = _factorise(cells, rest, free, soft, kind)
     b, frames = moments(cells.edges, cells.weights, cells.membership, rest)
     start, start_held = laplacian_start(cells, free & (soft == 0), kind)
     system = System(
@@ -260,10 +260,10 @@ def precompute(
     return Problem(system, index, Anchor(held, start_held))
 
 
-def _factorise(cells: Cells, free: np.ndarray, soft: np.ndarray, dtype: np.dtype):
+def _factorise(cells: Cells, rest, free: np.ndarray, soft: np.ndarray, dtype: np.dtype):
     matrix = stiffness(cells) + sp.diags(soft)
     try:
-        return cells, matrix, *factorise(matrix, free, dtype)
+        return cells, matrix, *factorise(matrix, free, dtype, positions=rest)
     except NotPositiveDefinite:
         pass
     floor = 1e-3 * np.abs(cells.weights).mean()
@@ -271,7 +271,7 @@ def _factorise(cells: Cells, free: np.ndarray, soft: np.ndarray, dtype: np.dtype
     cells = Cells(cells.edges, np.maximum(cells.weights, floor), cells.membership)
     matrix = stiffness(cells) + sp.diags(soft)
     try:
-        factored = factorise(matrix, free, dtype)
+        factored = factorise(matrix, free, dtype, positions=rest)
     except NotPositiveDefinite as error:
         raise InputError(
             "the system of the free vertices is singular even with positive weights: the mesh "
@@ -377,7 +377,7 @@ def energy(
     p = check_positions("vertices", vertices, (n, 3), dtype).T - system.center[:, None]
     t = check_positions("transforms", transforms, (n, 3, 3), dtype)
     lam = check_rigidity(rigidity, n, dtype)
-    t = jnp.einsum("kai,ijk->ajk", t, system.frames)
+    t = jnp.einsum("kai,ijk->ajk", t, system.frames, precision="highest")
     stiff = system.stiffness.apply(p) - system.soft[None] * p
     return jnp.sum(p * stiff) + local_energy(t, system.scatter(p), system.b, lam)
 
@@ -495,9 +495,9 @@ def _evaluate(system: System, held: _Held, p, known=None, *, local: LocalStep, n
     # The factor holds the system's own weights; others enter here only.
     stiff = system.stiffness.apply(p) + (held.soft - system.soft)[None] * p
     pull = system.scatter.adjoint(t) + held.soft[None] * held.targets
-    scale = jnp.vdot(p, stiff)
+    scale = total(p * stiff)
     # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
-    springs = jnp.vdot(held.soft[None] * held.targets, held.targets - 2.0 * p)
+    springs = total(held.soft[None] * held.targets * (held.targets - 2.0 * p))
     gradient = jnp.where(system.free[None], stiff - pull, 0.0)
     # The energy is a small difference of scale, hence its rounding error.
     rounding = 20.0 * jnp.finfo(p.dtype).eps * jnp.abs(scale)
@@ -511,22 +511,24 @@ def _fit_with_normals(system: System, held: _Held, local: LocalStep, p, c, known
     """
     rest_normal = vertex_normals(system.rest, system.faces)
     normal = vertex_normals(p, system.faces)
-    b = jnp.einsum("iak,ak,jak->kij", system.frames, system.b, system.frames)
-    b = b + jnp.einsum("ik,jk->kij", rest_normal, rest_normal)
+    b = jnp.einsum("iak,ak,jak->kij", system.frames, system.b, system.frames, precision="highest")
+    b = b + jnp.einsum("ik,jk->kij", rest_normal, rest_normal, precision="highest")
     moments, frames = jnp.linalg.eigh(b)
     frames = frames * jnp.sign(jnp.linalg.det(frames))[:, None, None]
     moments, frames = moments.T, jnp.moveaxis(frames, 0, -1)
     # From the frames of the problem to these.
-    turn = jnp.einsum("iak,ibk->abk", system.frames, frames)
-    c = jnp.einsum("abk,ack->bck", turn, c)
-    c = c + jnp.einsum("ibk,ik,ck->bck", frames, rest_normal, normal)
+    turn = jnp.einsum("iak,ibk->abk", system.frames, frames, precision="highest")
+    c = jnp.einsum("abk,ack->bck", turn, c, precision="highest")
+    c = c + jnp.einsum("ibk,ik,ck->bck", frames, rest_normal, normal, precision="highest")
     if known is None:
         t = fit(local, c, moments, held.rigidity)
     else:
-        t = local.attach(jnp.einsum("cak,abk->cbk", known, turn), c, moments, held.rigidity)
+        t = local.attach(
+            jnp.einsum("cak,abk->cbk", known, turn, precision="highest"), c, moments, held.rigidity
+        )
     has_normal = jnp.sum(normal * normal, axis=0)
     cells = local_energy(t, c, moments, held.rigidity) + jnp.sum(has_normal)
-    return jnp.einsum("cbk,abk->cak", t, turn), cells
+    return jnp.einsum("cbk,abk->cak", t, turn, precision="highest"), cells
 
 
 def vertex_normals(positions: Float[Array, "3 n"], faces: Int[Array, "m 3"]) -> Float[Array, "3 n"]:
@@ -560,7 +562,7 @@ def _solve(system, held, start, local, solver, normals, adjoint) -> Solution:
         jnp.arange(history.shape[0], dtype=steps.dtype) >= steps, state.energy, history
     )
     finite = jnp.isfinite(state.energy) & jnp.all(jnp.isfinite(p))
-    world = jnp.einsum("aik,jik->kaj", state.transforms, system.frames)
+    world = jnp.einsum("aik,jik->kaj", state.transforms, system.frames, precision="highest")
     return Solution(
         vertices=(p + system.center[:, None]).T,
         transforms=world,

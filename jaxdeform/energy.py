@@ -237,10 +237,16 @@ def local_energy(
     stretch = sum((gram[i][i] - 1.0) ** 2 for i in range(3))
     shear = sum(gram[i][j] ** 2 for i in range(3) for j in range(i))
     data = sum(b[i] * gram[i][i] - 2.0 * _dot(transforms[:, i], c[i]) for i in range(3))
-    cells = rigidity * (stretch + 2.0 * shear) + data
-    # A choice that changes nothing, but that XLA does not take into the sum: there a single thread
-    # would work out all cells (0.8 instead of 0.2 ms for 51,200).
-    return jnp.sum(jnp.where(jnp.isnan(cells), jnp.nan, cells))
+    return total(rigidity * (stretch + 2.0 * shear) + data)
+
+
+def total(x: Float[Array, "..."]) -> Float[Array, ""]:
+    """Return the sum over all entries, which are worked out first, in parallel.
+
+    A plain sum would take their expression into itself, where a single thread works it out (0.8
+    instead of 0.2 ms for 51,200 cells). The choice changes nothing, but keeps XLA from doing so.
+    """
+    return jnp.sum(jnp.where(jnp.isnan(x), jnp.nan, x))
 
 
 def _dot(u: Float[Array, "3 n"], v: Float[Array, "3 n"]) -> Float[Array, "n"]:

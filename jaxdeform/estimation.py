@@ -553,7 +553,7 @@ def _prior(problem: Problem) -> tuple[_Prior, object]:
     shifted = laplacian + 1e-2 * sp.identity(mesh.n_vertices)
     everywhere = np.ones(mesh.n_vertices, bool)
     dtype = problem.dtype
-    factor, anchor = factorise(shifted.tocsr(), everywhere, dtype)
+    factor, anchor = factorise(shifted.tocsr(), everywhere, dtype, positions=mesh.vertices)
     prior = _Prior(
         Rows.build([laplacian], dtype),
         factor,

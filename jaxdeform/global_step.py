@@ -4,6 +4,9 @@ The free unknowns are eliminated from the fixed ones beforehand: a factor holds 
 free vertices only, takes (..., 3, n) right-hand sides, ignores their fixed entries and returns
 zeros there. All its shapes depend on the number of vertices alone, so another handle set runs the
 code that is compiled already.
+
+Up to DENSE_BELOW vertices it is the inverse; beyond, CHOLMOD's factor on the host where that is the
+device, and on a GPU or TPU one made of products (nested_dissection.py).
 """
 
 import itertools
@@ -17,6 +20,8 @@ import numpy as np
 import scipy.sparse as sp
 from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Bool, Float, Int
+
+from jaxdeform.nested_dissection import DissectedFactor, dissected_factor
 
 # Up to this many vertices the inverse is kept as a dense matrix (one product per solve, no call
 # back to the host). Measured in docs/benchmarks.md: the two cross between 700 and 1,500 vertices.
@@ -34,7 +39,9 @@ class DenseFactor(eqx.Module):
 
     def solve(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
         """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed vertices."""
-        return right @ self.inverse
+        # A GPU would by default round float32 to TF32, three digits, before it multiplies. So all
+        # products of this package name their precision.
+        return jnp.matmul(right, self.inverse, precision="highest")
 
 
 class SparseFactor(eqx.Module):
@@ -155,17 +162,22 @@ def _lookup(number: int) -> HostFactor:
         ) from None
 
 
-Factor = DenseFactor | SparseFactor
+Factor = DenseFactor | DissectedFactor | SparseFactor
 
 
 def factorise(
-    matrix: sp.spmatrix, free: Bool[np.ndarray, "n"], dtype: np.dtype, *, lazy: bool = False
+    matrix: sp.spmatrix,
+    free: Bool[np.ndarray, "n"],
+    dtype: np.dtype,
+    *,
+    positions: Float[np.ndarray, "n 3"] | None = None,
 ) -> tuple[Factor, "HostFactor | None"]:
     """Return a factor of the free part of a symmetric positive definite matrix (n, n).
 
-    With it comes what an :class:`Anchor` must hold, None for a dense factor.
+    With it comes what an :class:`Anchor` must hold, None unless the factor is on the host.
 
-    ``lazy`` puts the work off until the first solve (sparse factors only).
+    Without positions, where the unknowns lie, a large factor is on the host in any case and made at
+    the first solve: for what is solved once a deformation.
 
     **Raises** NotPositiveDefinite.
     """
@@ -182,9 +194,19 @@ def factorise(
             half = np.linalg.solve(lower, np.eye(len(index)))
             inverse[np.ix_(index, index)] = half.T @ half
         return DenseFactor(jnp.asarray(inverse, dtype)), None
+    if positions is not None and has_accelerator():
+        try:
+            return dissected_factor(matrix, free, positions, np.dtype(dtype)), None
+        except np.linalg.LinAlgError as error:
+            raise NotPositiveDefinite(str(error)) from error
     host = HostFactor(matrix, free, np.dtype(dtype))
-    if not lazy and free.any():
+    if positions is not None and free.any():
         host.factorise()
     number = next(_numbers)
     _factors[number] = host
     return SparseFactor(jnp.asarray(number, jnp.int32)), host
+
+
+def has_accelerator() -> bool:
+    """Whether calls back to the host would cost more than the products that avoid them."""
+    return jax.default_backend() != "cpu"

@@ -167,7 +167,12 @@ def rigid_targets(
         centers = total / jnp.asarray(size, dtype)[:, None]
     else:
         centers = check_positions("centers", centers, shape, dtype, unit="group")
-    moved = jnp.einsum("hij,hj->hi", rotation_matrices(rotations)[group], points - centers[group])
+    moved = jnp.einsum(
+        "hij,hj->hi",
+        rotation_matrices(rotations)[group],
+        points - centers[group],
+        precision="highest",
+    )
     return moved + (centers + translations)[group]
 
 

@@ -41,7 +41,7 @@ def laplacian_start(
     """Set up the normal equations, and what keeps a large factor (made at first use) alive."""
     laplacian = normalised_laplacian(cells)
     normal = (laplacian.T @ laplacian).tocsr()
-    factor, held = factorise(normal, free, dtype, lazy=True)
+    factor, held = factorise(normal, free, dtype)
     return LaplacianStart(Rows.build([normal], dtype), factor), held
 
 
@@ -133,13 +133,14 @@ def laplacian_editor(
         operator = sp.kron(sp.identity(3), laplacian) - _turned_details(mesh, laplacian)
         pull = np.zeros((1, 3 * n))
         free, soft = np.tile(free, 3), np.tile(soft, 3)
+        positions = np.tile(mesh.vertices, (3, 1))
     else:
-        operator = laplacian
+        operator, positions = laplacian, mesh.vertices
         pull = (laplacian.T @ (laplacian @ mesh.vertices)).T
     normal = (operator.T @ operator + sp.diags(soft)).tocsr()
     dtype = np.dtype(jnp.result_type(float))
     try:
-        factor, held = factorise(normal, free, dtype)
+        factor, held = factorise(normal, free, dtype, positions=positions)
     except NotPositiveDefinite as error:
         raise InputError(
             "the handles do not determine the shape: hold at least three vertices that are not on "

@@ -237,7 +237,7 @@ def _attach_material_jvp(primals, tangents):
 
 def _cell_objective(t, c, b, lam):
     """Eq. 4.2 for one cell, (3, 3); the form that jaxopt and the thesis's descent see."""
-    strain = t.T @ t - jnp.eye(3, dtype=t.dtype)
+    strain = jnp.matmul(t.T, t, precision="highest") - jnp.eye(3, dtype=t.dtype)
     return lam * jnp.sum(strain**2) + jnp.sum(t**2 * b[None, :]) - 2.0 * jnp.sum(t * c.T)
 
 
@@ -427,7 +427,8 @@ def _newton_cell(max_steps: int, x, m, b, lam, tolerance) -> Float[Array, "3 3"]
     scale = lam + jnp.sum(jnp.abs(b)) + jnp.sum(jnp.abs(m))
 
     def half_gradient(x):
-        return 2.0 * lam * (x @ x.T @ x - x) + x * b[None] - m.T
+        cube = jnp.einsum("ij,kj,kl->il", x, x, x, precision="highest")
+        return 2.0 * lam * (cube - x) + x * b[None] - m.T
 
     def advance(state):
         step, x, before, damping = state
@@ -569,9 +570,11 @@ def _svd_rotation(rotation: Grid, c: Grid) -> Grid:
     """Return the rotations by LAPACK's SVD, which settles the cells with several best ones."""
     del rotation
     u, _, vt = jnp.linalg.svd(jnp.moveaxis(_stack(c), -1, 0))
-    sign = jnp.sign(jnp.linalg.det(u @ vt))
+    sign = jnp.sign(jnp.linalg.det(u) * jnp.linalg.det(vt))
     last = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign], axis=-1)
-    return _grid(jnp.moveaxis(jnp.einsum("kij,ki,kli->kjl", vt, last, u), 0, -1))
+    return _grid(
+        jnp.moveaxis(jnp.einsum("kij,ki,kli->kjl", vt, last, u, precision="highest"), 0, -1)
+    )
 
 
 @jax.custom_jvp

@@ -19,9 +19,16 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform.global_step import has_accelerator
+
 # Lanes that iterate together. More would wait more for each other at the end, and outgrow the
-# caches; fewer would leave the cores idle (64 bars: 8, 16 and 32 slots within a tenth).
+# caches; fewer would leave the cores idle (64 bars: 4, 8, 16 and 32 slots within a tenth. Going on
+# with 4 slots once no more lanes are left takes a tenth off, and compiles twice as long).
 SLOTS = 16
+
+# On an accelerator, as many lanes as have this many vertices together, which fills it; their arrays
+# then take about 4 GB in float64. (Reasoned, not measured: no accelerator was at hand.)
+VERTICES_AT_ONCE = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -142,7 +149,8 @@ class _Slots(NamedTuple):
 
 def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
     count = start.shape[0]
-    slots = min(count, SLOTS)
+    most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
+    slots = min(count, most)
     out = Descent(
         jnp.zeros_like(start),
         jnp.zeros((count, 3, *start.shape[1:]), start.dtype),
@@ -231,7 +239,7 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     dz, y = z - work.z, new.gradient - work.at.gradient
     # All inner products of a turn that are not with the memory, as one batched product.
     left, right = jnp.stack([step, dz, z], axis=1), jnp.stack([y, new.gradient], axis=1)
-    products = jnp.einsum("wiak,wjak->wij", left, right)
+    products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
     memory = _remember(work.memory, tick, good & ~first, good, step, dz, new.gradient, products)
     keep = lambda new, old: jnp.where(good.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
     at = jax.tree.map(keep, new, work.at)
@@ -271,8 +279,8 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 n"]:
     # From the order of age to that of the ring, whose oldest slot is the one to fill now.
     place = (jnp.arange(m, dtype=tick.dtype) - tick) % m
     alpha, gamma = alpha[:, place, 0], gamma[:, place, 0]
-    back = jnp.einsum("wm,wmak->wak", alpha, memory.z)
-    return back - jnp.einsum("wm,wmak->wak", gamma, memory.s) - z
+    back = jnp.einsum("wm,wmak->wak", alpha, memory.z, precision="highest")
+    return back - jnp.einsum("wm,wmak->wak", gamma, memory.s, precision="highest") - z
 
 
 def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
@@ -285,8 +293,8 @@ def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memor
     sy, yzy = products[:, 0, 0], products[:, 1, 0]
     # (NaN fails the comparison; so nothing that is not finite ever comes in.)
     kept = new & (sy > 1e-10 * yzy) & jnp.isfinite(yzy)
-    sg = jnp.einsum("wmak,wak->wm", memory.s, g)[:, age]
-    zg = jnp.einsum("wmak,wak->wm", memory.z, g)[:, age]
+    sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
+    zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
     column, square = sg - memory.sg, zg - memory.zg
 
     def later(matrix, row, column, corner):

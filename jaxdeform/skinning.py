@@ -389,7 +389,7 @@ def rigid_transforms(
     translations = check_positions("translations", translations, shape, dtype, unit="control")
     centers = check_positions("centers", centers, shape, dtype, unit="control")
     turn = rotation_matrices(rotations)
-    shift = centers + translations - jnp.einsum("mij,mj->mi", turn, centers)
+    shift = centers + translations - jnp.einsum("mij,mj->mi", turn, centers, precision="highest")
     return jnp.concatenate([turn, shift[:, :, None]], axis=2)
 
 
@@ -418,7 +418,7 @@ def linear_blend_skinning(
         [[1.0, 1.0, 0.0]]
     """
     vertices, weights, transforms = _checked_skin(vertices, weights, transforms)
-    blend = jnp.einsum("nm,mij->nij", weights, transforms)
+    blend = jnp.einsum("nm,mij->nij", weights, transforms, precision="highest")
     return _apply(blend[:, :, :3], blend[:, :, 3], vertices)
 
 
@@ -450,9 +450,10 @@ def dual_quaternion_skinning(
     shift = jnp.concatenate([jnp.zeros_like(real[:, :1]), transforms[:, :, 3]], axis=1)
     dual = 0.5 * _product(shift, real)
     # Both signs are the same rotation: the one nearer to the heaviest control's.
-    side = jnp.where(real @ real.T < 0.0, -1.0, 1.0).astype(real.dtype)
+    nearness = jnp.matmul(real, real.T, precision="highest")
+    side = jnp.where(nearness < 0.0, -1.0, 1.0).astype(real.dtype)
     signed = weights * side[jnp.argmax(weights, axis=1)]
-    real, dual = signed @ real, signed @ dual
+    real, dual = (jnp.matmul(signed, q, precision="highest") for q in (real, dual))
     length = jnp.linalg.norm(real, axis=1, keepdims=True)
     real, dual = real / length, dual / length
     conjugate = real * jnp.asarray([1.0, -1.0, -1.0, -1.0], real.dtype)[None]
@@ -460,7 +461,7 @@ def dual_quaternion_skinning(
 
 
 def _apply(turn, shift, vertices) -> Float[Array, "n 3"]:
-    return jnp.einsum("nij,nj->ni", turn, vertices) + shift
+    return jnp.einsum("nij,nj->ni", turn, vertices, precision="highest") + shift
 
 
 def _quaternions(turn: Float[Array, "m 3 3"]) -> Float[Array, "m 4"]:
@@ -533,7 +534,9 @@ def _squares(vertices, controls, distances) -> Float[Array, "n m"]:
             "different ends, or points (m, 3)"
         )
     arm = vertices[:, None] - ends[None, :, 0]
-    part = jnp.clip(jnp.einsum("nmi,mi->nm", arm, along / square[:, None]), 0.0, 1.0)
+    part = jnp.clip(
+        jnp.einsum("nmi,mi->nm", arm, along / square[:, None], precision="highest"), 0.0, 1.0
+    )
     return jnp.sum((arm - part[:, :, None] * along[None]) ** 2, axis=2)
 
 

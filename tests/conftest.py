@@ -15,7 +15,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # public functions: they take whatever numpy can read (at run time no type says so), and misuse
 # must reach their own checks.
 install_import_hook(
-    [f"jaxdeform.{name}" for name in ("formats", "laplacian", "energy", "global_step")],
+    [
+        f"jaxdeform.{name}"
+        for name in ("formats", "laplacian", "energy", "nested_dissection", "global_step")
+    ],
     "beartype.beartype",
 )
 

@@ -18,7 +18,7 @@ PACKAGE = ROOT / "jaxdeform"
 # A file imports from lower floors, or from its own above it in this list.
 FLOORS = {
     0: ["formats", "mesh", "laplacian", "neighborhood", "shapes", "handles"],
-    1: ["energy", "local_step", "global_step", "quasi_newton", "skinning"],
+    1: ["energy", "local_step", "nested_dissection", "global_step", "quasi_newton", "skinning"],
     2: ["laplacian_editing"],
     3: ["deformation"],
     4: ["submesh", "estimation"],
