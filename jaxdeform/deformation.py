@@ -557,12 +557,10 @@ def _solve(system, held, start, local, solver, normals, adjoint) -> Solution:
         p, known, history, steps, code = _implicit(system, held, p, evaluate, solver, adjoint)
     else:
         p, known, history, steps, code = _alternate(system, held, p, evaluate, solver)
-    state = evaluate(system, held, p=p, known=jax.lax.stop_gradient(known))
-    history = jnp.where(
-        jnp.arange(history.shape[0], dtype=steps.dtype) >= steps, state.energy, history
-    )
-    finite = jnp.isfinite(state.energy) & jnp.all(jnp.isfinite(p))
-    world = jnp.einsum("aik,jik->kaj", state.transforms, system.frames, precision="highest")
+    known, energy = _attach_end(evaluate, system, held, p, known, history[steps])
+    history = jnp.where(jnp.arange(history.shape[0], dtype=steps.dtype) >= steps, energy, history)
+    finite = jnp.isfinite(energy) & jnp.all(jnp.isfinite(p))
+    world = jnp.einsum("aik,jik->kaj", known, system.frames, precision="highest")
     return Solution(
         vertices=(p + system.center[:, None]).T,
         transforms=world,
@@ -570,6 +568,30 @@ def _solve(system, held, start, local, solver, normals, adjoint) -> Solution:
         steps=steps,
         result=Result(jnp.where(finite, code, 3)),
     )
+
+
+def _attach_end(evaluate, system: System, held: _Held, p, known, energy):
+    """Return the transformations and the energy at p with their derivatives.
+
+    Both are known, so nothing is evaluated (nor compiled) unless derivatives are asked for.
+    """
+
+    @jax.custom_jvp
+    def end(system, held, p, known, energy):
+        del system, held, p
+        return known, energy
+
+    @end.defjvp
+    def end_jvp(primals, tangents):
+        system, held, p, *reached = primals
+
+        def run(held, p):
+            at = evaluate(system, held, p=p, known=reached[0])
+            return at.transforms, at.energy
+
+        return tuple(reached), jax.jvp(run, (held, p), tuple(tangents[1:3]))[1]
+
+    return end(system, held, p, known, energy)
 
 
 def _alternate(system: System, held: _Held, p, evaluate, solver: Alternating):
