@@ -291,10 +291,11 @@ def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memor
     m = memory.filled.shape[1]
     age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
     sy, yzy = products[:, 0, 0], products[:, 1, 0]
-    # (NaN fails the comparison; so nothing that is not finite ever comes in.)
-    kept = new & (sy > 1e-10 * yzy) & jnp.isfinite(yzy)
     sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
     zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
+    # (NaN fails the comparison; so nothing that is not finite ever comes in.) That it reads sg and
+    # zg tells the compiler that the old arrays are done with, so it writes into them, not a copy.
+    kept = new & (sy > 1e-10 * yzy) & jnp.isfinite(yzy + jnp.sum(sg + zg, axis=1))
     column, square = sg - memory.sg, zg - memory.zg
 
     def later(matrix, row, column, corner):
