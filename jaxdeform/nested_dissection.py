@@ -6,7 +6,7 @@ on together. What a triangular solve would do one unknown after another is done 
 stored inverses instead (Alvarado, Pothen and Schreiber 1993): per level a gather and a batched
 product on the way up the tree, the same on the way down. No scatter, no host.
 
-Made for accelerators. On two cores it takes two to four times as long as CHOLMOD
+Made for accelerators. On two cores it takes up to 2.5 times as long as CHOLMOD
 (docs/benchmarks.md).
 """
 
