@@ -181,30 +181,29 @@ def factorise(
 
     **Raises** NotPositiveDefinite.
     """
-    n = matrix.shape[0]
-    if n <= DENSE_BELOW:
-        index = np.flatnonzero(free)
-        inverse = np.zeros((n, n))
-        if len(index):
-            block = _inner(matrix, index).toarray()
-            try:
-                lower = np.linalg.cholesky(block)
-            except np.linalg.LinAlgError as error:
-                raise NotPositiveDefinite(str(error)) from error
-            half = np.linalg.solve(lower, np.eye(len(index)))
-            inverse[np.ix_(index, index)] = half.T @ half
-        return DenseFactor(jnp.asarray(inverse, dtype)), None
-    if positions is not None and has_accelerator():
-        try:
+    try:
+        if matrix.shape[0] <= DENSE_BELOW:
+            return _dense_factor(matrix, free, dtype), None
+        if positions is not None and has_accelerator():
             return dissected_factor(matrix, free, positions, np.dtype(dtype)), None
-        except np.linalg.LinAlgError as error:
-            raise NotPositiveDefinite(str(error)) from error
+    except np.linalg.LinAlgError as error:
+        raise NotPositiveDefinite(str(error)) from error
     host = HostFactor(matrix, free, np.dtype(dtype))
     if positions is not None and free.any():
         host.factorise()
     number = next(_numbers)
     _factors[number] = host
     return SparseFactor(jnp.asarray(number, jnp.int32)), host
+
+
+def _dense_factor(matrix: sp.spmatrix, free: Bool[np.ndarray, "n"], dtype) -> DenseFactor:
+    n, index = matrix.shape[0], np.flatnonzero(free)
+    inverse = np.zeros((n, n))
+    if len(index):
+        lower = np.linalg.cholesky(_inner(matrix, index).toarray())
+        half = np.linalg.solve(lower, np.eye(len(index)))
+        inverse[np.ix_(index, index)] = half.T @ half
+    return DenseFactor(jnp.asarray(inverse, dtype))
 
 
 def has_accelerator() -> bool:

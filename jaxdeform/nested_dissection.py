@@ -284,8 +284,8 @@ class _Border(NamedTuple):
     def of(part, vertex, parts: int, n: int) -> "_Border":
         """Collect pairs of part and vertex, each once."""
         key = np.unique(part * n + vertex)
-        slot, width = _ranks(key // max(n, 1), parts)
-        return _Border(key // max(n, 1), key % max(n, 1), slot, width, key, n)
+        part, vertex = np.divmod(key, n)
+        return _Border(part, vertex, *_ranks(part, parts), key, n)
 
     def find(self, part, vertex):
         """Return the slots of vertices in the borders of parts; anything where there is none."""
