@@ -483,25 +483,48 @@ def _soft(problem: Problem, weights: ArrayLike | None) -> Float[Array, "n"]:
 # ---------------------------------------------------------------- the iterations
 
 
-def _evaluate(system: System, held: _Held, p, known=None, *, local: LocalStep, normals: bool):
-    """Evaluate at p; with ``known`` transformations the local step is not run again."""
+def _evaluate(
+    system: System,
+    held: _Held,
+    p,
+    known=None,
+    *,
+    local: LocalStep,
+    normals: bool,
+    lanes: int | None = None,
+):
+    """Evaluate at p; with ``known`` transformations the local step is not run again.
+
+    The last axis of p and held may be (vertex, lane); energies then are those of the lanes.
+    """
     run = partial(fit, local) if known is None else partial(local.attach, known)
-    c = system.scatter(p)
+    w = lanes or 1
+    b, free, soft = (jnp.repeat(x, w, axis=-1) for x in (system.b, system.free, system.soft))
+    c = system.scatter(p, w)
     if normals:
         t, cells = _fit_with_normals(system, held, local, p, c, known)
     else:
-        t = run(c, system.b, held.rigidity)
-        cells = local_energy(t, c, system.b, held.rigidity)
+        t = run(c, b, held.rigidity)
+        cells = local_energy(t, c, b, held.rigidity, lanes)
     # The factor holds the system's own weights; others enter here only.
-    stiff = system.stiffness.apply(p) + (held.soft - system.soft)[None] * p
-    pull = system.scatter.adjoint(t) + held.soft[None] * held.targets
-    scale = total(p * stiff)
+    stiff = system.stiffness.apply(p, w) + (held.soft - soft)[None] * p
+    pull = system.scatter.adjoint(t, w) + held.soft[None] * held.targets
+    scale = total(p * stiff, lanes)
     # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
-    springs = total(held.soft[None] * held.targets * (held.targets - 2.0 * p))
-    gradient = jnp.where(system.free[None], stiff - pull, 0.0)
+    springs = total(held.soft[None] * held.targets * (held.targets - 2.0 * p), lanes)
+    gradient = jnp.where(free[None], stiff - pull, 0.0)
     # The energy is a small difference of scale, hence its rounding error.
     rounding = 20.0 * jnp.finfo(p.dtype).eps * jnp.abs(scale)
     return Sample(t, gradient, scale + springs + cells, rounding)
+
+
+def _evaluate_lanes(evaluate, system: System, held: _Held, p: Float[Array, "3 n lanes"]) -> Sample:
+    """Evaluate lanes side by side: all arrays, also those of held, have the lanes last."""
+    lanes = p.shape[-1]
+    flat = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), (held, p))
+    at = evaluate(system, *flat, lanes=lanes)
+    t, g = (x.reshape(*x.shape[:-1], -1, lanes) for x in (at.transforms, at.gradient))
+    return at._replace(transforms=t, gradient=g)
 
 
 def _fit_with_normals(system: System, held: _Held, local: LocalStep, p, c, known):
@@ -648,7 +671,8 @@ def _implicit(system: System, held: _Held, p, evaluate, solver, adjoint: Implici
     @jax.custom_jvp
     def root(system, held, p):
         if isinstance(solver, QuasiNewton):
-            p, known, history, steps, converged = minimize(evaluate, system, held, p, solver)
+            lanes = partial(_evaluate_lanes, evaluate)
+            p, known, history, steps, converged = minimize(lanes, system, held, p, solver)
             code = jnp.where(converged, 1, 2)
         else:
             p, known, history, steps, code = _alternate(system, held, p, evaluate, solver)

@@ -70,10 +70,10 @@ def _over_lanes(local: LocalStep):
         n = data[0].shape[-1]
         spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (lanes, *x.shape))  # noqa: E731
         flat = [
-            jnp.moveaxis(spread(x, is_), 0, -2).reshape(*x.shape[is_:-1], lanes * n)
+            jnp.moveaxis(spread(x, is_), 0, -1).reshape(*x.shape[is_:-1], n * lanes)
             for x, is_ in zip(data, batched, strict=True)
         ]
-        return jnp.moveaxis(minimize(*flat).reshape(3, 3, lanes, n), -2, 0), True
+        return jnp.moveaxis(minimize(*flat).reshape(3, 3, n, lanes), -1, 0), True
 
     return minimize
 

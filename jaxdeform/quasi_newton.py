@@ -22,9 +22,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform.global_step import has_accelerator
 
 # Lanes that iterate together. More would wait more for each other at the end, and outgrow the
-# caches; fewer would leave the cores idle (64 bars: 4, 8, 16 and 32 slots within a tenth. Going on
-# with 4 slots once no more lanes are left takes a tenth off, and compiles twice as long).
-SLOTS = 16
+# caches; fewer would leave the cores idle (a lane of 64 bars: 10.5, 10.3, 11.2, 13.7 and 16.1 ms
+# with 8, 12, 16, 24 and 32 slots. Going on with 4 once no lanes are left takes a tenth off, and
+# compiles twice as long).
+SLOTS = 12
 
 # On an accelerator, as many lanes as have this many vertices together, which fills it; their arrays
 # then take about 4 GB in float64. (Reasoned, not measured: no accelerator was at hand.)
@@ -49,13 +50,13 @@ class QuasiNewton:
 
 
 class Sample(NamedTuple):
-    """What one evaluation at p tells."""
+    """What one evaluation at p tells, in one or in several lanes."""
 
-    transforms: Float[Array, "3 3 n"]
-    gradient: Float[Array, "3 n"]
+    transforms: Float[Array, "3 3 n *w"]
+    gradient: Float[Array, "3 n *w"]
     """Half the gradient of the reduced energy, 0 at fixed vertices: A p - K^T T."""
-    energy: Float[Array, ""]
-    rounding: Float[Array, ""]
+    energy: Float[Array, "*w"]
+    rounding: Float[Array, "*w"]
     """Two energies closer than this differ by rounding alone."""
 
 
@@ -88,7 +89,8 @@ def minimize(
 ) -> Descent:
     """Minimise from a start; under vmap over ``held`` and ``start``, lane by lane in slots.
 
-    ``evaluate(system, held, p)`` tells of one p, ``system.factor.solve`` is A^-1.
+    ``evaluate(system, held, p)`` tells of the p of several slots, which are the last axis of all it
+    takes and returns; ``system.factor.solve`` is A^-1.
     """
 
     @custom_vmap
@@ -132,7 +134,11 @@ class _Memory(NamedTuple):
 
 
 class _Slots(NamedTuple):
-    """The lanes at work: an accepted position each, and what was evaluated there."""
+    """The lanes at work: an accepted position each, and what was evaluated there.
+
+    The slots come first, since products with the memory are slot by slot; in ``at`` they come last,
+    since an evaluation is vertex by vertex (energy.py).
+    """
 
     p: Float[Array, "w 3 n"]
     at: Sample
@@ -158,6 +164,8 @@ def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
         jnp.zeros(count, jnp.int32),
         jnp.zeros(count, bool),
     )
+    if not count:
+        return out
     work = _empty(start[:slots], settings)
     work = _restart(work, jnp.ones(slots, bool), work.p)
     lane = jnp.arange(slots, dtype=jnp.int32)
@@ -165,7 +173,7 @@ def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
     def turn_over(state):
         """Iterate until a lane is done; put it away and take the next ones."""
         tick, lane, following, work, out = state
-        own = jax.tree.map(lambda x: x.at[lane].get(mode="clip"), held)
+        own = jax.tree.map(lambda x: jnp.moveaxis(x.at[lane].get(mode="clip"), 0, -1), held)
         advance = partial(_advance, evaluate, system, own, settings)
         idle = lane >= count
         tick, work = jax.lax.while_loop(
@@ -173,7 +181,8 @@ def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
         )
         done = _done(work, settings) & ~idle
         ended = work.stalled | _converged(work, settings)
-        found = Descent(work.p, work.at.transforms, work.history, work.turn - 1, ended)
+        transforms = jnp.moveaxis(work.at.transforms, -1, 0)
+        found = Descent(work.p, transforms, work.history, work.turn - 1, ended)
         place = jnp.where(done, lane, count)
         out = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), out, found)
         lane = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, lane)
@@ -189,7 +198,7 @@ def _empty(p: Float[Array, "w 3 n"], settings: QuasiNewton) -> _Slots:
     w, m, dtype = p.shape[0], settings.memory, p.dtype
     zeros = lambda *shape: jnp.zeros((w, *shape), dtype)  # noqa: E731
     shape, small = p.shape[1:], (m, m)
-    at = Sample(zeros(3, *shape), zeros(*shape), zeros(), zeros())
+    at = Sample(*(jnp.zeros((*axes, w), dtype) for axes in ((3, *shape), shape, (), ())))
     filled = jnp.zeros((w, m), bool)
     memory = _Memory(
         zeros(m, *shape), zeros(m, *shape), filled, zeros(*small), zeros(*small), zeros(m), zeros(m)
@@ -229,32 +238,23 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     # step is compiled once.) A lane that is done waits.
     step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
     p = work.p + step
-    new = _apart(tick >= 0, work.at, partial(_each, partial(evaluate, system)), held, p)
-    z = system.factor.solve(new.gradient)
+    new = _apart(tick >= 0, work.at, partial(evaluate, system), held, jnp.moveaxis(p, 0, -1))
+    y, g = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 1)
+    z = system.factor.solve(g)
+    dz = z - work.z
     first = work.turn == 0
     good = (new.energy <= work.at.energy + work.at.rounding) | first
     # A refused step costs its evaluation and the memory; the plain step that follows cannot raise
     # the energy, so a second refusal in a row is rounding.
     stalled = work.stalled | (~good & ~jnp.any(work.memory.filled, axis=1))
-    dz, y = z - work.z, new.gradient - work.at.gradient
-    # All inner products of a turn that are not with the memory, as one batched product.
-    left, right = jnp.stack([step, dz, z], axis=1), jnp.stack([y, new.gradient], axis=1)
-    products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
-    memory = _remember(work.memory, tick, good & ~first, good, step, dz, new.gradient, products)
-    keep = lambda new, old: jnp.where(good.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
-    at = jax.tree.map(keep, new, work.at)
+    memory = _remember(work.memory, tick, good & ~first, good, step, dz, y, g)
+    keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
+    at, wide = jax.tree.map(keep, new, work.at), good[:, None, None]
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
     history = work.history.at[slot, work.turn].set(at.energy, mode="drop")
-    p, z, gain = keep(p, work.p), keep(z, work.z), keep(products[:, 2, 1], work.gain)
+    p, z = jnp.where(wide, p, work.p), jnp.where(wide, z, work.z)
+    gain = keep(_inner(z, g), work.gain)
     return tick + 1, _Slots(p, at, z, gain, work.turn + 1, history, memory, stalled)
-
-
-def _each(function, *arguments):
-    """Map over the slots; without vmap where there is one (it would trace the local step twice)."""
-    slots = jax.tree.leaves(arguments)[0].shape[0]
-    if slots != 1:
-        return jax.vmap(function)(*arguments)
-    return jax.tree.map(lambda x: x[None], function(*jax.tree.map(lambda x: x[0], arguments)))
 
 
 def _apart(always: Bool[Array, ""], otherwise, function, *arguments):
@@ -289,14 +289,18 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 n"]:
     return back - jnp.einsum("wm,wmak->wak", gamma, memory.s, precision="highest") - z
 
 
-def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
+def _inner(a: Float[Array, "w 3 n"], b: Float[Array, "w 3 n"]) -> Float[Array, "w"]:
+    return jnp.einsum("wak,wak->w", a, b, precision="highest")
+
+
+def _remember(memory: _Memory, tick, new, good, step, dz, y, g) -> _Memory:
     """Put new steps into the oldest slot, if the curvature along them is positive.
 
     A lane whose step was not good forgets all.
     """
     m = memory.filled.shape[1]
     age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
-    sy, yzy = products[:, 0, 0], products[:, 1, 0]
+    sy, yzy = _inner(step, y), _inner(dz, y)
     sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
     zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
     # (NaN fails the comparison; so nothing that is not finite ever comes in.) That it reads sg and
@@ -318,6 +322,6 @@ def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memor
         filled=append(memory.filled & good[:, None], kept),
         sy=later(memory.sy, jnp.zeros_like(column), column, sy),
         yzy=later(memory.yzy, square, square, yzy),
-        sg=append(sg, products[:, 0, 1]),
-        zg=append(zg, products[:, 1, 1]),
+        sg=append(sg, _inner(step, g)),
+        zg=append(zg, _inner(dz, g)),
     )

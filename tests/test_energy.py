@@ -141,6 +141,27 @@ def test_scatter_and_adjoint_are_adjoint(name):
     np.testing.assert_allclose(tangent, system.scatter(x), atol=EXACT)
 
 
+@pytest.mark.parametrize("name", ["cylinder", "bar"])
+def test_lanes_side_by_side_are_every_lane_alone(name):
+    mesh = getattr(jd.shapes, name)()
+    system = jd.precompute(mesh, [0]).system
+    rng = np.random.default_rng(3)
+    n = mesh.n_vertices
+    p, t = (jnp.asarray(rng.normal(size=(5, *s, n))) for s in ((3,), (3, 3)))
+    products = (
+        (system.scatter, p),
+        (system.scatter.adjoint, t),
+        (system.stiffness.apply, p),
+    )
+    for product, x in products:
+        alone = np.stack([product(lane) for lane in x], axis=-1)
+        flat = jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], n * 5)
+        together = product(flat, 5)
+        np.testing.assert_allclose(together.reshape(alone.shape), alone, atol=EXACT)
+        under_vmap = jax.vmap(lambda k, x=flat, f=product: f(k * x, 5))(jnp.array([1.0, -2.0]))
+        np.testing.assert_allclose(under_vmap[1], -2.0 * together, atol=EXACT)
+
+
 def test_cotangent_weights_are_libigls():
     mesh = jd.shapes.cactus()
     matrix = igl.cotmatrix(mesh.vertices, mesh.faces).tocsr()
