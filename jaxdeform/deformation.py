@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -23,6 +23,8 @@ from jaxdeform.handles import (
     check_positions,
     check_targets,
     known,
+    read_array,
+    read_positions,
 )
 from jaxdeform.laplacian_editing import LaplacianStart, laplacian_start
 from jaxdeform.local_step import LocalStep, Newton, fit
@@ -348,8 +350,9 @@ def deform(
     targets = check_targets(targets, len(problem.handles), dtype)
     rigidity = check_rigidity(rigidity, n, dtype)
     if start is not None:
-        start = check_positions("start", start, (n, 3), dtype)
-    held = _Held(_spread(problem, targets), rigidity, _soft(problem, handle_weights))
+        start = read_positions("start", start, (n, 3), dtype)
+    given = _spread(problem, targets), rigidity, _soft(problem, handle_weights)
+    held = _Held(*(cast(Array, x) for x in given))  # JAX's arrays once they are inside
     solution = _solve(problem.system, held, start, local, solver, normals, adjoint)
     if not isinstance(solution.vertices, Tracer):
         # The host's factor lives as long as the problem; do not outrun it.
@@ -376,7 +379,7 @@ def energy(
     n, dtype, system = problem.n_vertices, problem.dtype, problem.system
     p = check_positions("vertices", vertices, (n, 3), dtype).T - system.center[:, None]
     t = check_positions("transforms", transforms, (n, 3, 3), dtype)
-    lam = check_rigidity(rigidity, n, dtype)
+    lam = jnp.asarray(check_rigidity(rigidity, n, dtype))
     t = jnp.einsum("kai,ijk->ajk", t, system.frames, precision="highest")
     stiff = system.stiffness.apply(p) - system.soft[None] * p
     return jnp.sum(p * stiff) + local_energy(t, system.scatter(p), system.b, lam)
@@ -399,7 +402,7 @@ def material(problem: Problem, constant: ArrayLike) -> Float[Array, "n"]:
         (722,)
     """
     constant = check_rigidity(constant, problem.n_vertices, problem.dtype, name="constant")
-    return constant * jnp.maximum(jnp.sum(problem.system.b, axis=0), 0.0) / 2.0
+    return jnp.asarray(constant) * jnp.maximum(jnp.sum(problem.system.b, axis=0), 0.0) / 2.0
 
 
 # ---------------------------------------------------------------- checks of the arguments
@@ -407,9 +410,9 @@ def material(problem: Problem, constant: ArrayLike) -> Float[Array, "n"]:
 
 def check_rigidity(
     rigidity: ArrayLike, n: int, dtype: np.dtype, *, name: str = "rigidity"
-) -> Float[Array, "n"]:
+) -> Float[Array, "n"] | Float[np.ndarray, "n"]:
     """Return rigidity as one number per vertex, or raise InputError naming what is wrong."""
-    array = as_array(rigidity, dtype, name)
+    array = read_array(rigidity, dtype, name)
     if array.shape not in ((), (n,)):
         raise InputError(
             f"{name} has shape {array.shape}: give one number, or one per vertex, ({n},)"
@@ -422,7 +425,7 @@ def check_rigidity(
             raise InputError(
                 f"{name} is {values[bad[0]]}{where}: it must be a finite number, 0 or more"
             )
-    return jnp.broadcast_to(array, (n,))
+    return (jnp if isinstance(array, Array) else np).broadcast_to(array, (n,))
 
 
 def _check_settings(solver, adjoint, normals: bool) -> None:
@@ -441,7 +444,9 @@ def _check_settings(solver, adjoint, normals: bool) -> None:
         )
 
 
-def _spread(problem: Problem, targets: Array) -> Float[Array, "3 n"]:
+def _spread(
+    problem: Problem, targets: Array | np.ndarray
+) -> Float[Array, "3 n"] | Float[np.ndarray, "3 n"]:
     """Spread the targets over an array of all vertices, in NumPy where they are known.
 
     So the compiled code sees shapes that depend on the mesh alone: another number of handles does
@@ -451,7 +456,7 @@ def _spread(problem: Problem, targets: Array) -> Float[Array, "3 n"]:
         spread = np.array(problem.system.rest)
         center = np.asarray(problem.system.center)
         spread[:, problem.handles] = (np.asarray(targets) - center).T
-        return jnp.asarray(spread)
+        return spread
     moved = (targets - problem.system.center[None]).T
     return problem.system.rest.at[:, problem.handles].set(moved)
 
