@@ -239,21 +239,25 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
     p = work.p + step
     new = _apart(tick >= 0, work.at, partial(evaluate, system), held, jnp.moveaxis(p, 0, -1))
-    y, g = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 1)
-    z = system.factor.solve(g)
+    right = jnp.stack([new.gradient - work.at.gradient, new.gradient])
+    right = jnp.moveaxis(right, -1, 0)
+    z = system.factor.solve(right[:, 1])
     dz = z - work.z
+    # All inner products of a turn that are not with the memory, as one batched product.
+    left = jnp.stack([step, dz, z], axis=1)
+    products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
     first = work.turn == 0
     good = (new.energy <= work.at.energy + work.at.rounding) | first
     # A refused step costs its evaluation and the memory; the plain step that follows cannot raise
     # the energy, so a second refusal in a row is rounding.
     stalled = work.stalled | (~good & ~jnp.any(work.memory.filled, axis=1))
-    memory = _remember(work.memory, tick, good & ~first, good, step, dz, y, g)
+    memory = _remember(work.memory, tick, good & ~first, good, step, dz, right[:, 1], products)
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
     at, wide = jax.tree.map(keep, new, work.at), good[:, None, None]
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
     history = work.history.at[slot, work.turn].set(at.energy, mode="drop")
     p, z = jnp.where(wide, p, work.p), jnp.where(wide, z, work.z)
-    gain = keep(_inner(z, g), work.gain)
+    gain = keep(products[:, 2, 1], work.gain)
     return tick + 1, _Slots(p, at, z, gain, work.turn + 1, history, memory, stalled)
 
 
@@ -289,18 +293,14 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 n"]:
     return back - jnp.einsum("wm,wmak->wak", gamma, memory.s, precision="highest") - z
 
 
-def _inner(a: Float[Array, "w 3 n"], b: Float[Array, "w 3 n"]) -> Float[Array, "w"]:
-    return jnp.einsum("wak,wak->w", a, b, precision="highest")
-
-
-def _remember(memory: _Memory, tick, new, good, step, dz, y, g) -> _Memory:
+def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
     """Put new steps into the oldest slot, if the curvature along them is positive.
 
     A lane whose step was not good forgets all.
     """
     m = memory.filled.shape[1]
     age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
-    sy, yzy = _inner(step, y), _inner(dz, y)
+    sy, yzy = products[:, 0, 0], products[:, 1, 0]
     sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
     zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
     # (NaN fails the comparison; so nothing that is not finite ever comes in.) That it reads sg and
@@ -322,6 +322,6 @@ def _remember(memory: _Memory, tick, new, good, step, dz, y, g) -> _Memory:
         filled=append(memory.filled & good[:, None], kept),
         sy=later(memory.sy, jnp.zeros_like(column), column, sy),
         yzy=later(memory.yzy, square, square, yzy),
-        sg=append(sg, _inner(step, g)),
-        zg=append(zg, _inner(dz, g)),
+        sg=append(sg, products[:, 0, 1]),
+        zg=append(zg, products[:, 1, 1]),
     )
