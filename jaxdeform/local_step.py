@@ -101,7 +101,8 @@ class Newton(_Material):
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
         """Return the minimisers T (3, 3, n)."""
         rotation = _polar(_grid(c))
-        m = _product(_grid(c), rotation)  # symmetric: C R = U S U^T
+        m = _product(_grid(c), rotation)
+        m = [[m[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]  # C R = U S U^T
         data = m, list(b), rigidity, _tolerance(m, rigidity)
         x, hard = _block_newton(*data)
         few = max(64, hard.shape[0] // 64)
