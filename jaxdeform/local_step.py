@@ -542,7 +542,10 @@ def _markley(c: Grid) -> tuple[Grid, Bool[Array, "n"]]:
         return x - move, jnp.abs(move)
 
     bound = jnp.sqrt(square + 2.0 * jnp.sqrt(3.0 * area))
-    x, move = jax.lax.fori_loop(0, 6, newton, (bound, bound))
+    # Three steps in one pass over the cells. (As a loop, or the compiler would repeat them in each
+    # of the nine entries that follow.)
+    thrice = lambda _, state: reduce(lambda s, k: newton(k, s), range(3), state)  # noqa: E731
+    x, move = jax.lax.fori_loop(0, 2, thrice, (bound, bound))
     kappa = 0.5 * (x * x - square)
     zeta = kappa * x - det
     gram = _product(_transpose(a), a)
