@@ -438,7 +438,7 @@ def batch(quick: bool) -> list[Metric]:
                 # Rigidities differ in their number of steps, so a single one is their mean.
                 "one": lambda one=one: [jax.block_until_ready(one(r)) for r in lanes[::8]],
             },
-            3,
+            3 if quick else 15,
         )
         ratio = (seconds["many"] / 64) / (seconds["one"] / 8)
         name = f"batch of 64, {type(solver).__name__}, time per lane / single"

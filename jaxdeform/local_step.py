@@ -319,8 +319,8 @@ def _block_newton(
     few = n // 8 if n > SMALL else 0
     x, waiting = _block_steps(x, *data, leave=few)
     if few:
-        both = lambda state, *data: _block_steps(state[0], *data, leave=0)  # noqa: E731
-        x, waiting = _on_few(both, waiting, few, (x, waiting), *data)
+        again = lambda state, *data: _block_steps(state[0], *data, leave=0)  # noqa: E731
+        x, waiting = _on_few(again, waiting, few, (x, waiting), *data)
     return x, waiting
 
 
