@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxdeform.energy import Rows, Scatter, local_energy, scatter, stiffness, total
+from jaxdeform.energy import Rows, Scatter, by_lane, local_energy, scatter, stiffness, total
 from jaxdeform.global_step import Anchor, Factor, NotPositiveDefinite, factorise
 from jaxdeform.handles import (
     as_array,
@@ -528,7 +528,7 @@ def _evaluate_lanes(evaluate, system: System, held: _Held, p: Float[Array, "3 n 
     lanes = p.shape[-1]
     flat = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), (held, p))
     at = evaluate(system, *flat, lanes=lanes)
-    t, g = (x.reshape(*x.shape[:-1], -1, lanes) for x in (at.transforms, at.gradient))
+    t, g = by_lane(at.transforms, lanes), by_lane(at.gradient, lanes)
     return at._replace(transforms=t, gradient=g)
 
 

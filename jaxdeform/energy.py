@@ -81,11 +81,12 @@ class Rows(eqx.Module):
     def apply(self, x: Float[Array, "... v"], lanes: int = 1) -> Float[Array, "... v"]:
         """Return the product of a single symmetric matrix (c = 1) and x."""
         tables = jax.tree.leaves(self)
-        out = _scatter_p.bind(_by_lane(x, lanes), *tables, *tables)
+        out = _scatter_p.bind(by_lane(x, lanes), *tables, *tables)
         return out.reshape(x.shape)
 
 
-def _by_lane(x: Float[Array, "... v"], lanes: int) -> Float[Array, "... n lanes"]:
+def by_lane(x: Float[Array, "... v"], lanes: int) -> Float[Array, "... n lanes"]:
+    """Return x with vertices and lanes on axes of their own."""
     return x.reshape(*x.shape[:-1], -1, lanes)
 
 
@@ -208,12 +209,12 @@ class Scatter(eqx.Module):
 
     def __call__(self, positions: Float[Array, "3 v"], lanes: int = 1) -> Float[Array, "3 3 v"]:
         """Return C (rest axis, deformed axis, cell)."""
-        out = _scatter_p.bind(_by_lane(positions, lanes), *self._tables())
+        out = _scatter_p.bind(by_lane(positions, lanes), *self._tables())
         return jnp.swapaxes(out.reshape(3, 3, -1), 0, 1)
 
     def adjoint(self, transforms: Float[Array, "3 3 v"], lanes: int = 1) -> Float[Array, "3 v"]:
         """Return K^T T for T (deformed axis, rest axis, cell)."""
-        out = _adjoint_p.bind(_by_lane(transforms, lanes), *self._tables())
+        out = _adjoint_p.bind(by_lane(transforms, lanes), *self._tables())
         return out.reshape(3, -1)
 
     def _tables(self):

@@ -239,9 +239,9 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
     p = work.p + step
     new = _apart(tick >= 0, work.at, partial(evaluate, system), held, jnp.moveaxis(p, 0, -1))
-    right = jnp.stack([new.gradient - work.at.gradient, new.gradient])
-    right = jnp.moveaxis(right, -1, 0)
-    z = system.factor.solve(right[:, 1])
+    right = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 0)
+    g = right[:, 1]
+    z = system.factor.solve(g)
     dz = z - work.z
     # All inner products of a turn that are not with the memory, as one batched product.
     left = jnp.stack([step, dz, z], axis=1)
@@ -251,11 +251,12 @@ def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
     # A refused step costs its evaluation and the memory; the plain step that follows cannot raise
     # the energy, so a second refusal in a row is rounding.
     stalled = work.stalled | (~good & ~jnp.any(work.memory.filled, axis=1))
-    memory = _remember(work.memory, tick, good & ~first, good, step, dz, right[:, 1], products)
+    memory = _remember(work.memory, tick, good & ~first, good, step, dz, g, products)
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
-    at, wide = jax.tree.map(keep, new, work.at), good[:, None, None]
+    at = jax.tree.map(keep, new, work.at)
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
     history = work.history.at[slot, work.turn].set(at.energy, mode="drop")
+    wide = good[:, None, None]
     p, z = jnp.where(wide, p, work.p), jnp.where(wide, z, work.z)
     gain = keep(products[:, 2, 1], work.gain)
     return tick + 1, _Slots(p, at, z, gain, work.turn + 1, history, memory, stalled)
