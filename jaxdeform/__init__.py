@@ -57,6 +57,8 @@ from jaxdeform.skinning import (
 )
 from jaxdeform.submesh import Part, cut
 
+__version__ = "0.1.0"  # pyproject.toml reads it from here
+
 __all__ = [
     "LBFGS",
     "AffineFit",
