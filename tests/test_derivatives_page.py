@@ -34,7 +34,7 @@ def cells():
     """C, the principal moments and the rigidity of a few cells that are turned and strained."""
     rng = np.random.default_rng(4)
     b = rng.uniform(0.2, 2.0, (3, 5))
-    turned = Rotation.random(5, random_state=4).as_matrix()
+    turned = Rotation.random(5, rng=4).as_matrix()
     strained = turned + 0.2 * rng.normal(size=(5, 3, 3))
     return jnp.asarray(np.einsum("ak,kca->ack", b, strained)), jnp.asarray(b), jnp.full(5, 0.7)
 
