@@ -287,9 +287,9 @@ def factors(quick: bool) -> list[Metric]:
     import scipy.sparse.linalg
 
     from jaxdeform import global_step
+    from jaxdeform._linalg.nested_dissection import dissected_factor
     from jaxdeform.energy import stiffness
     from jaxdeform.global_step import factorise
-    from jaxdeform.nested_dissection import dissected_factor
 
     out, double = [], np.dtype(float)
     solve = jax.jit(lambda factor, b: factor.solve(b))

@@ -1,19 +1,39 @@
 """jaxdeform: differentiable mesh deformation in JAX, every part with its own rigidity."""
 
 from jaxdeform import shapes
-from jaxdeform.deformation import (
-    Alternating,
-    Implicit,
-    Problem,
-    QuasiNewton,
-    Result,
-    Solution,
-    Unrolled,
-    deform,
-    energy,
-    material,
-    precompute,
+from jaxdeform._baselines.cages import mean_value_coordinates
+from jaxdeform._baselines.laplacian_editing import (
+    LaplacianEditor,
+    laplacian_editing,
+    laplacian_editor,
 )
+from jaxdeform._baselines.skeletons import Skeleton, load_skeleton
+from jaxdeform._baselines.skinning import (
+    dual_quaternion_skinning,
+    linear_blend_skinning,
+    rigid_transforms,
+)
+from jaxdeform._baselines.skinning_weights import (
+    bounded_biharmonic_weights,
+    geodesic_distances,
+    inverse_distance_weights,
+    rigid_weights,
+)
+from jaxdeform._deformation.adjoint import Implicit, Unrolled
+from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
+from jaxdeform._deformation.problem import Problem, material, precompute
+from jaxdeform._deformation.quasi_newton import QuasiNewton
+from jaxdeform._deformation.solve import Result, Solution, deform, energy
+from jaxdeform._handles.files import HandleFile, load_handles
+from jaxdeform._handles.rigid import rigid_targets
+from jaxdeform._mesh.cells import Cells, rings, spokes
+from jaxdeform._mesh.files import check_output, load_mesh, load_rigidity, save_mesh
+from jaxdeform._mesh.inspection import Inspection, inspect, repair
+from jaxdeform._mesh.laplacian import cotangent_weights
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.submesh import Part, cut
+from jaxdeform.errors import InputError
 from jaxdeform.estimation import (
     Estimate,
     FieldEstimate,
@@ -25,37 +45,8 @@ from jaxdeform.estimation import (
     find_handle_groups,
     find_handles,
 )
-from jaxdeform.handles import HandleFile, load_handles, rigid_targets
-from jaxdeform.laplacian import cotangent_weights
-from jaxdeform.laplacian_editing import LaplacianEditor, laplacian_editing, laplacian_editor
-from jaxdeform.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
-from jaxdeform.mesh import (
-    InputError,
-    Inspection,
-    Mesh,
-    check_output,
-    inspect,
-    load_mesh,
-    load_rigidity,
-    repair,
-    save_mesh,
-)
-from jaxdeform.neighborhood import Cells, rings, spokes
-from jaxdeform.pictures import picture
+from jaxdeform.plotting import picture
 from jaxdeform.shapes import bend, rotate, translate, twist
-from jaxdeform.skinning import (
-    Skeleton,
-    bounded_biharmonic_weights,
-    dual_quaternion_skinning,
-    geodesic_distances,
-    inverse_distance_weights,
-    linear_blend_skinning,
-    load_skeleton,
-    mean_value_coordinates,
-    rigid_transforms,
-    rigid_weights,
-)
-from jaxdeform.submesh import Part, cut
 
 __all__ = [
     "LBFGS",

@@ -28,8 +28,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-from jaxdeform.laplacian import difference_matrix
-from jaxdeform.neighborhood import Cells
+from jaxdeform._mesh.cells import Cells
+from jaxdeform._mesh.laplacian import difference_matrix
 
 # A row with more entries than this is continued in an overflow row, so that one vertex of valence
 # 40 (a pole) does not make every row 40 wide.

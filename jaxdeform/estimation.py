@@ -16,21 +16,17 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxdeform.deformation import (
-    Alternating,
-    Implicit,
-    Problem,
-    QuasiNewton,
-    Unrolled,
-    check_rigidity,
-    deform,
-    material,
-)
+from jaxdeform._deformation.adjoint import Implicit, Unrolled
+from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.problem import Problem, material
+from jaxdeform._deformation.quasi_newton import QuasiNewton
+from jaxdeform._deformation.solve import deform
+from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform.checks import as_array, check_positions, check_rigidity
 from jaxdeform.energy import Rows
+from jaxdeform.errors import InputError
 from jaxdeform.global_step import Factor, factorise
-from jaxdeform.handles import as_array, check_positions
-from jaxdeform.laplacian import cotangent_weights, graph_laplacian
-from jaxdeform.mesh import InputError, Mesh
 
 # Outside of these, as material constants (rigidity over tr(B) / 2), nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.

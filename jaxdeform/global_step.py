@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform.nested_dissection import DissectedFactor, dissected_factor
+from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
 
 # Up to this many vertices the inverse is kept as a dense matrix (one product per solve, no call
 # back to the host). Measured in docs/benchmarks.md: the two cross between 700 and 1,500 vertices.

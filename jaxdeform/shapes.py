@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdeform.mesh import InputError, Mesh
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform.errors import InputError
 
 # ---------------------------------------------------------------- meshes
 

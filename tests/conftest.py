@@ -17,7 +17,13 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 install_import_hook(
     [
         f"jaxdeform.{name}"
-        for name in ("formats", "laplacian", "energy", "nested_dissection", "global_step")
+        for name in (
+            "_mesh.formats",
+            "_mesh.laplacian",
+            "energy",
+            "_linalg.nested_dissection",
+            "global_step",
+        )
     ],
     "beartype.beartype",
 )

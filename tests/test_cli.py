@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import jaxdeform as jd
-from jaxdeform.cli import main
+from jaxdeform._apps.cli import main
 
 
 @pytest.fixture

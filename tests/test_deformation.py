@@ -10,7 +10,7 @@ from conftest import EXACT, FD, PEER, ends, real_mesh
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
-from jaxdeform import quasi_newton
+from jaxdeform._linalg import lbfgs
 
 TWENTY = jd.Alternating(steps=20)
 
@@ -285,7 +285,7 @@ def test_vmap_over_targets_rigidity_and_start(bar, bar_problem, bar_targets):
 
 def test_queue_of_lanes_is_every_lane_alone(bar, bar_problem, bar_targets):
     """More lanes than iterate together, of unlike lengths, one of them broken; nested vmap too."""
-    lam = np.geomspace(0.01, 100.0, 2 * quasi_newton.SLOTS + 5)
+    lam = np.geomspace(0.01, 100.0, 2 * lbfgs.SLOTS + 5)
 
     def one(r):
         return jd.deform(bar_problem, bar_targets, r)

@@ -11,7 +11,7 @@ import pytest
 from conftest import EXACT, FD, ends, real_mesh
 
 import jaxdeform as jd
-from jaxdeform import cli
+from jaxdeform._apps import cli
 from jaxdeform.estimation import _deform_all, _handle_modes, _Poses, _sandwich, _weigh
 
 THESIS = jd.Alternating(steps=100)

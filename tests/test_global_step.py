@@ -11,10 +11,11 @@ import scipy.sparse.linalg
 from conftest import EXACT, ends
 
 import jaxdeform as jd
-from jaxdeform import global_step, nested_dissection
+from jaxdeform import global_step
+from jaxdeform._deformation.initial_guess import normalised_laplacian
+from jaxdeform._linalg import nested_dissection
+from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
 from jaxdeform.energy import stiffness
-from jaxdeform.laplacian_editing import normalised_laplacian
-from jaxdeform.nested_dissection import DissectedFactor, dissected_factor
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def accelerator(monkeypatch):
     jax.clear_caches()
     monkeypatch.setattr(global_step, "DENSE_BELOW", 0)
     monkeypatch.setattr(global_step, "has_accelerator", lambda: True)
-    monkeypatch.setattr("jaxdeform.quasi_newton.has_accelerator", lambda: True)
+    monkeypatch.setattr("jaxdeform._linalg.lbfgs.has_accelerator", lambda: True)
     yield
     jax.clear_caches()
 

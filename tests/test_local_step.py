@@ -9,8 +9,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
-from jaxdeform import local_step
-from jaxdeform.local_step import polar_rotation
+from jaxdeform._deformation import local_step
+from jaxdeform._linalg.rotations import polar_rotation
 
 # Compiled once for each solver and number of cells; called plainly, every call compiles anew.
 fit = jax.jit(local_step.fit, static_argnums=0)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxdeform as jd
-from jaxdeform.mesh import write_beside
+from jaxdeform._mesh.files import write_beside
 
 SUFFIXES = (".obj", ".off", ".ply", ".stl")
 

@@ -108,9 +108,6 @@ def _with_zero(x: Array, axis: int) -> Array:
     return jnp.pad(x, [(0, int(k == axis)) for k in range(x.ndim)])
 
 
-# ---------------------------------------------------------------- making it, on the host
-
-
 def dissected_factor(
     matrix: sp.spmatrix,
     free: Bool[np.ndarray, "n"],

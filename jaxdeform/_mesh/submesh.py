@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
-from jaxdeform.mesh import InputError, Mesh
-from jaxdeform.neighborhood import Cells, rings
+from jaxdeform._mesh.cells import Cells, rings
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

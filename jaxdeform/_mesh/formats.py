@@ -9,9 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-
-class InputError(ValueError):
-    """Raised for every misuse: names vertex, face, file or argument, the reason, the next move."""
+from jaxdeform.errors import InputError
 
 
 def _broken(path: Path, what: str) -> InputError:
@@ -64,9 +62,6 @@ def _shown(row: list[bytes]) -> str:
     return repr(b" ".join(row)[:40].decode("ascii", "replace"))
 
 
-# ---------------------------------------------------------------- OBJ
-
-
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     points, corners = [], []
     for number, line in enumerate(data.splitlines(), 1):
@@ -108,9 +103,6 @@ def _text(lines: list[str]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-# ---------------------------------------------------------------- OFF
-
-
 def _parse_off(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     rows = _rows(data)
     # COFF, NOFF and the like put colours or normals after the position; 4OFF changes it.
@@ -133,9 +125,6 @@ def _to_off(points: np.ndarray, faces: np.ndarray) -> bytes:
     lines += [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
     lines += [f"3 {i} {j} {k}" for i, j, k in faces.tolist()]
     return _text(lines)
-
-
-# ---------------------------------------------------------------- PLY
 
 
 _PLY_COUNTS = {
@@ -282,9 +271,6 @@ def to_ply(points: np.ndarray, faces: np.ndarray, rigidity: np.ndarray | None = 
     triangles["length"], triangles["corners"] = 3, faces
     table = np.stack(list(columns.values()), axis=1).astype("<f8")
     return _text(lines) + table.tobytes() + triangles.tobytes()
-
-
-# ---------------------------------------------------------------- STL
 
 
 _STL_FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("more", "<u2")])

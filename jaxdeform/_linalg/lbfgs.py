@@ -10,7 +10,6 @@ queue instead: a few slots iterate together, and a slot whose lane is done takes
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,27 +25,17 @@ from jaxdeform.global_step import has_accelerator
 # with 8, 12, 16, 24 and 32 slots. Going on with 4 once no lanes are left takes a tenth off, and
 # compiles twice as long).
 SLOTS = 12
-
 # On an accelerator, as many lanes as have this many vertices together, which fills it; their arrays
 # then take about 4 GB in float64. (Reasoned, not measured: no accelerator was at hand.)
 VERTICES_AT_ONCE = 1 << 22
 
 
-@dataclass(frozen=True)
-class QuasiNewton:
-    """L-BFGS on the reduced energy E(p') = min_T E(p', T), with A^-1 as initial inverse Hessian.
+class Settings(NamedTuple):
+    """When to stop, and how much to remember; see :class:`QuasiNewton`."""
 
-    The first step is the alternating one, and so is any step after a refused one: a step that
-    would raise the energy is dropped with its history. An iteration costs what an alternating one
-    costs, and far fewer are needed: on the bar 41 where that needs 145 to come within 1e-4 of
-    the minimum, 72 where it needs 519 to 1e-9.
-    """
-
-    tolerance: float = 1e-8
-    """Stop once a plain step is expected to lower the energy by less than this part of it."""
-    max_steps: int = 500
-    memory: int = 6
-    """Number of past steps that shape the next one."""
+    tolerance: float
+    max_steps: int
+    memory: int
 
 
 class Sample(NamedTuple):
@@ -85,7 +74,7 @@ def minimize(
     system: Any,
     held: Any,
     start: Float[Array, "3 n"],
-    settings: QuasiNewton,
+    settings: Settings,
 ) -> Descent:
     """Minimise from a start; under vmap over ``held`` and ``start``, lane by lane in slots.
 
@@ -110,9 +99,6 @@ def minimize(
 
     one = jax.tree.map(lambda x: x[None], (held, start))
     return jax.tree.map(lambda x: x[0], lanes(system, *one))
-
-
-# ---------------------------------------------------------------- the queue
 
 
 class _Memory(NamedTuple):
@@ -153,7 +139,7 @@ class _Slots(NamedTuple):
     stalled: Bool[Array, "w"]
 
 
-def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
+def _run_queue(evaluate, system, held, start, settings: Settings) -> Descent:
     count = start.shape[0]
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
     slots = min(count, most)
@@ -194,7 +180,7 @@ def _run_queue(evaluate, system, held, start, settings: QuasiNewton) -> Descent:
     return jax.lax.while_loop(lambda s: jnp.any(s[1] < count), turn_over, begin)[-1]
 
 
-def _empty(p: Float[Array, "w 3 n"], settings: QuasiNewton) -> _Slots:
+def _empty(p: Float[Array, "w 3 n"], settings: Settings) -> _Slots:
     w, m, dtype = p.shape[0], settings.memory, p.dtype
     zeros = lambda *shape: jnp.zeros((w, *shape), dtype)  # noqa: E731
     shape, small = p.shape[1:], (m, m)
@@ -220,19 +206,16 @@ def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 n"]) ->
     )
 
 
-def _converged(work: _Slots, settings: QuasiNewton) -> Bool[Array, "w"]:
+def _converged(work: _Slots, settings: Settings) -> Bool[Array, "w"]:
     return has_converged(work.gain, work.at.energy, work.at.rounding, settings.tolerance)
 
 
-def _done(work: _Slots, settings: QuasiNewton) -> Bool[Array, "w"]:
+def _done(work: _Slots, settings: Settings) -> Bool[Array, "w"]:
     running = (work.turn <= settings.max_steps) & ~work.stalled & ~_converged(work, settings)
     return (work.turn > 0) & ~(running & jnp.isfinite(work.at.energy))
 
 
-# ---------------------------------------------------------------- one turn of all slots
-
-
-def _advance(evaluate, system, held, settings: QuasiNewton, tick, work: _Slots):
+def _advance(evaluate, system, held, settings: Settings, tick, work: _Slots):
     step = _direction(work.memory, work.z, tick)
     # The first turn evaluates the start: its step is zero, its old energy infinite. (So the local
     # step is compiled once.) A lane that is done waits.

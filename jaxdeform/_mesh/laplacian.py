@@ -5,7 +5,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-from jaxdeform.mesh import Mesh
+from jaxdeform._mesh.mesh import Mesh
 
 
 def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:

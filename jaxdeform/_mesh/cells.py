@@ -7,8 +7,9 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxdeform.laplacian import cotangent_weights
-from jaxdeform.mesh import InputError, Mesh
+from jaxdeform._mesh.laplacian import cotangent_weights
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,10 @@ from rich.table import Table
 jax.config.update("jax_enable_x64", True)
 
 import jaxdeform as jd  # noqa: E402 (after x64)
-from jaxdeform.deformation import check_rigidity  # noqa: E402
+from jaxdeform._mesh.files import check_place, write_beside  # noqa: E402
+from jaxdeform.checks import check_rigidity  # noqa: E402
 from jaxdeform.estimation import check_parts  # noqa: E402
-from jaxdeform.mesh import check_place, write_beside  # noqa: E402
-from jaxdeform.pictures import check_picture  # noqa: E402
+from jaxdeform.plotting import check_picture  # noqa: E402
 
 app = typer.Typer(
     help="Deform triangle meshes whose parts differ in rigidity.",

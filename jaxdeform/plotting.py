@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxdeform.mesh import InputError, Mesh, check_place, write_beside
+from jaxdeform._mesh.files import check_place, write_beside
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform.errors import InputError
 
 
 def picture(

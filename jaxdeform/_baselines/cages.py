@@ -1,0 +1,104 @@
+"""Cages: mean value coordinates (Ju, Schaefer and Warren 2005)."""
+
+import igl
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform.errors import InputError
+
+
+def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "n m"]:
+    """Return mean value coordinates of points in a closed cage (Ju, Schaefer and Warren 2005).
+
+    They reproduce linear functions: rows sum to one and ``weights @ cage.vertices`` is the point.
+    A cage deformation is therefore ``weights @ deformed_cage_vertices``. Smooth inside, linear on
+    the cage's faces; negative for points that do not see the whole cage, if it is not convex.
+    (libigl's ``mvc`` is for polygons: it returns NaN for a cage in space.)
+
+    **Arguments**: vertices (n, 3), in the cage or on it; cage, a closed mesh of m vertices.
+
+    **Raises** InputError: an open cage; a point outside of it.
+
+    Example:
+        >>> import jaxdeform as jd, numpy as np
+        >>> cage = jd.shapes.bar()
+        >>> weights = jd.mean_value_coordinates([[1.0, 60.0, 2.0]], cage)
+        >>> np.allclose(weights @ cage.vertices, [[1.0, 60.0, 2.0]])
+        True
+    """
+    points = np.asarray(vertices, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise InputError(f"vertices have shape {points.shape}: give (n, 3) finite positions")
+    _check_cage(points, cage)
+    faces, corners = cage.faces, cage.vertices
+    out = np.empty((len(points), len(corners)))
+    # So many points at a time that the arrays per point and face stay within 100 MB.
+    step = max(1, 100_000 // len(faces))
+    for first in range(0, len(points), step):
+        some = slice(first, first + step)
+        out[some] = _mean_values(points[some], corners, faces)
+    return jnp.asarray(out, jnp.result_type(float))
+
+
+def _check_cage(points: Float[np.ndarray, "n 3"], cage: Mesh) -> None:
+    # Each edge of a closed surface is run along as often in one direction as in the other.
+    sides = cage.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges, place = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    balance = np.bincount(place.ravel(), np.where(sides[:, 0] < sides[:, 1], 1, -1))
+    if balance.any():
+        i, j = edges[np.flatnonzero(balance)[0]]
+        raise InputError(
+            f"the cage is open, or its faces are turned against each other, at the edge ({i}, "
+            f"{j}): give a closed mesh"
+        )
+    faces = np.ascontiguousarray(cage.faces)
+    inside = np.abs(igl.winding_number(cage.vertices, faces, points)) > 0.5
+    # On the cage itself the winding number is 1/2 give or take.
+    square, _, _ = igl.point_mesh_squared_distance(points, cage.vertices, faces)
+    near = np.sqrt(np.ravel(square)) < 1e-9 * np.ptp(cage.vertices, axis=0).max()
+    outside = np.flatnonzero(~(inside | near))
+    if outside.size:
+        raise InputError(
+            f"vertex {outside[0]} {points[outside[0]].tolist()} is outside the cage "
+            f"({outside.size} such): enlarge the cage"
+        )
+
+
+def _mean_values(points, corners, faces) -> Float[np.ndarray, "n m"]:
+    """Return the coordinates of points that may lie anywhere (Ju et al. 2005, Sec. 3).
+
+    Seen from a point, each face is a spherical triangle with the mean normal
+    ``m = sum_i theta_i n_i / 2``, where n_i is the unit normal of the plane through the point and
+    the side opposite to corner i. Its weights solve ``m = sum_i w_i (corner_i - point)``.
+    """
+    arm = corners[None] - points[:, None]
+    length = np.linalg.norm(arm, axis=2)
+    on_corner = length < 1e-12 * np.abs(corners).max()
+    unit = arm / np.where(on_corner, 1.0, length)[:, :, None]
+    u = unit[:, faces]
+    v, w = np.roll(u, -1, axis=2), np.roll(u, -2, axis=2)
+    theta = 2.0 * np.arctan2(np.linalg.norm(v - w, axis=3), np.linalg.norm(v + w, axis=3))
+    normal = np.cross(v, w)
+    sine = np.linalg.norm(normal, axis=3)
+    normal /= np.where(sine > 0, sine, 1.0)[..., None]
+    mean = 0.5 * np.einsum("pfi,pfix->pfx", theta, normal)
+    height = np.einsum("pfix,pfix->pfi", normal, u)
+    # In the plane of a face but outside of it, the face is an arc and weighs nothing.
+    flat = (np.abs(height) < 1e-9).any(axis=2, keepdims=True)
+    shares = np.einsum("pfix,pfx->pfi", normal, mean) / np.where(flat, np.inf, height)
+    shares /= np.where(on_corner, 1.0, length)[:, faces]
+    # On a face its barycentric coordinates are the limit; a corner takes all.
+    on_face = flat[:, :, 0] & (theta.sum(axis=2) > 2.0 * np.pi - 1e-9)
+    reach = length[:, faces]
+    area = sine * np.roll(reach, -1, axis=2) * np.roll(reach, -2, axis=2)
+    shares = np.where(on_face.any(axis=1)[:, None, None], on_face[:, :, None] * area, shares)
+    to_corner = sp.csr_matrix(
+        (np.ones(faces.size), (np.arange(faces.size), faces.ravel())), (faces.size, len(corners))
+    )
+    total = shares.reshape(len(points), -1) @ to_corner
+    total = np.where(on_corner.any(axis=1, keepdims=True), on_corner, total)
+    return total / total.sum(axis=1, keepdims=True)

@@ -1,0 +1,161 @@
+"""Linear blend and dual quaternion skinning: p'_i = sum_j w_ij T_j p_i (thesis chapter 3)."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxdeform._linalg.rotations import (
+    matrices_from_quaternions,
+    quaternion_product,
+    quaternions_from_matrices,
+)
+from jaxdeform.checks import as_array, check_positions, known, rows_of_three
+from jaxdeform.errors import InputError
+from jaxdeform.shapes import rotation_matrices
+
+
+def rigid_transforms(
+    rotations: ArrayLike, translations: ArrayLike, centers: ArrayLike
+) -> Float[Array, "m 3 4"]:
+    """Return the matrices of ``p -> R (p - center) + center + t``, one per control.
+
+    **Arguments**: rotations (m, 3), rotation vectors (their length is the angle in radians);
+    translations (m, 3); centers (m, 3). **Raises** InputError: shapes that differ.
+
+    Example:
+        >>> import jaxdeform as jd, numpy as np
+        >>> turn = jd.rigid_transforms([[0, 0, np.pi]], [[0, 0, 0]], [[1, 0, 0]])
+        >>> np.allclose(turn[0, :, 3], [2.0, 0.0, 0.0], atol=1e-6)
+        True
+    """
+    dtype = jnp.result_type(float)
+    rotations = as_array(rotations, dtype, "rotations")
+    if rotations.ndim != 2 or rotations.shape[1] != 3:
+        raise InputError(f"rotations have shape {rotations.shape}: give (m, 3) rotation vectors")
+    shape = rotations.shape
+    rotations = check_positions("rotations", rotations, shape, dtype, unit="control")
+    translations = check_positions("translations", translations, shape, dtype, unit="control")
+    centers = check_positions("centers", centers, shape, dtype, unit="control")
+    turn = rotation_matrices(rotations)
+    shift = centers + translations - jnp.einsum("mij,mj->mi", turn, centers, precision="highest")
+    return jnp.concatenate([turn, shift[:, :, None]], axis=2)
+
+
+def linear_blend_skinning(
+    vertices: ArrayLike, weights: ArrayLike, transforms: ArrayLike
+) -> Float[Array, "n 3"]:
+    """Return ``p'_i = sum_j w_ij T_j p_i`` (thesis chapter 3).
+
+    Affine transformations are blended as matrices, so the blend of two rotations shrinks: a twist
+    of 180 degrees collapses the middle. See :func:`dual_quaternion_skinning`. A pure function of
+    arrays: jit, vmap (over poses), grad and jvp to all arguments.
+
+    **Arguments**
+
+    - vertices: (n, 3).
+    - weights: (n, m), rows with sum one.
+    - transforms: (m, 3, 4), the matrix and the shift of each control.
+
+    **Raises** InputError: shapes that do not fit; a row of weights whose sum is not one; values
+    that are not finite. Values are checked when they are known, shapes also while tracing.
+
+    Example:
+        >>> import jaxdeform as jd, numpy as np
+        >>> moves = jd.rigid_transforms(np.zeros((2, 3)), [[0, 0, 0], [0, 4, 0]], np.zeros((2, 3)))
+        >>> jd.linear_blend_skinning([[1.0, 0.0, 0.0]], [[0.75, 0.25]], moves).tolist()
+        [[1.0, 1.0, 0.0]]
+    """
+    vertices, weights, transforms = _checked_skin(vertices, weights, transforms)
+    blend = jnp.einsum("nm,mij->nij", weights, transforms, precision="highest")
+    return _apply(blend[:, :, :3], blend[:, :, 3], vertices)
+
+
+def dual_quaternion_skinning(
+    vertices: ArrayLike, weights: ArrayLike, transforms: ArrayLike
+) -> Float[Array, "n 3"]:
+    """Blend rigid transformations as unit dual quaternions (Kavan et al. 2008).
+
+    The blend of rigid motions is a rigid motion, so nothing shrinks. Of the two quaternions of a
+    rotation, each is taken that lies on the side of the vertex's heaviest control: the shorter way
+    round. Where two controls differ by exactly 180 degrees there is none, and the result jumps;
+    everywhere else it is smooth. Transformable as :func:`linear_blend_skinning`.
+
+    **Arguments** as there; weights >= 0, transforms rigid (rotation and shift).
+
+    **Raises** InputError as there; also for negative weights and a matrix that is no rotation.
+
+    Example:
+        >>> import jaxdeform as jd, numpy as np
+        >>> zero = np.zeros((2, 3))
+        >>> turn = jd.rigid_transforms([[0, 0, 0], [0, 0, np.pi / 2]], zero, zero)
+        >>> point = jd.dual_quaternion_skinning([[1.0, 0.0, 0.0]], [[0.5, 0.5]], turn)
+        >>> bool(abs(np.linalg.norm(point) - 1) < 1e-6)
+        True
+    """
+    vertices, weights, transforms = _checked_skin(vertices, weights, transforms)
+    _check_blendable(weights, transforms)
+    real = quaternions_from_matrices(transforms[:, :, :3])
+    shift = jnp.concatenate([jnp.zeros_like(real[:, :1]), transforms[:, :, 3]], axis=1)
+    dual = 0.5 * quaternion_product(shift, real)
+    # Both signs are the same rotation: the one nearer to the heaviest control's.
+    nearness = jnp.matmul(real, real.T, precision="highest")
+    side = jnp.where(nearness < 0.0, -1.0, 1.0).astype(real.dtype)
+    signed = weights * side[jnp.argmax(weights, axis=1)]
+    real, dual = (jnp.matmul(signed, q, precision="highest") for q in (real, dual))
+    length = jnp.linalg.norm(real, axis=1, keepdims=True)
+    real, dual = real / length, dual / length
+    conjugate = real * jnp.asarray([1.0, -1.0, -1.0, -1.0], real.dtype)[None]
+    return _apply(
+        matrices_from_quaternions(real), 2.0 * quaternion_product(dual, conjugate)[:, 1:], vertices
+    )
+
+
+def _apply(turn, shift, vertices) -> Float[Array, "n 3"]:
+    return jnp.einsum("nij,nj->ni", turn, vertices, precision="highest") + shift
+
+
+# How far a row of weights may be from one in sum, and R^T R of a rigid matrix from I: what single
+# precision and text files with six digits leave.
+_LOOSE = 1e-5
+
+
+def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
+    dtype = jnp.result_type(float)
+    vertices = rows_of_three("vertices", vertices, dtype)
+    weights = as_array(weights, dtype, "weights")
+    if weights.ndim != 2 or len(weights) != len(vertices):
+        raise InputError(
+            f"weights have shape {weights.shape}: give ({len(vertices)}, m), vertices by controls"
+        )
+    weights = check_positions("weights", weights, weights.shape, dtype)
+    if known(weights):
+        total = np.asarray(weights).sum(axis=1)
+        bad = np.flatnonzero(np.abs(total - 1.0) > _LOOSE)
+        if bad.size:
+            raise InputError(
+                f"the weights of vertex {bad[0]} sum to {total[bad[0]]:.6g}, not to 1: divide each "
+                "row by its sum"
+            )
+    shape = (weights.shape[1], 3, 4)
+    return vertices, weights, check_positions("transforms", transforms, shape, dtype, "control")
+
+
+def _check_blendable(weights: Array, transforms: Array) -> None:
+    if known(weights):
+        low = np.asarray(weights).min(axis=1, initial=0.0)
+        bad = np.flatnonzero(low < -_LOOSE)
+        if bad.size:
+            raise InputError(
+                f"a weight of vertex {bad[0]} is {low[bad[0]]:.6g}: dual quaternions blend between "
+                "motions only; give weights of 0 or more, or use linear_blend_skinning"
+            )
+    if known(transforms):
+        turn = np.asarray(transforms)[:, :, :3]
+        gap = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max(axis=(1, 2))
+        bad = np.flatnonzero((gap > _LOOSE) | (np.linalg.det(turn) < 0))
+        if bad.size:
+            raise InputError(
+                f"the matrix of control {bad[0]} is no rotation (it stretches, shears or "
+                "reflects): give rigid motions, or use linear_blend_skinning"
+            )

@@ -1,0 +1,130 @@
+"""Triangle meshes: checked once, then frozen (thesis chapter 2)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from jaxdeform.errors import InputError
+
+# A triangle lower than this part of its longest edge has no area that float64 could tell from
+# rounding; its cotangents would be noise. Thin but real ones (0.4 degrees) are 1e10 above it.
+_FLAT = 1e-13
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Mesh:
+    """A triangle mesh, checked once, when it is made.
+
+    Open borders, several components, unreferenced vertices, non-manifold edges and vertices, and
+    faces turned inwards are all allowed; :func:`inspect` reports them.
+
+    **Raises** InputError: arrays of the wrong shape or empty; a vertex that is not finite; a face
+    index out of range; a face that repeats a vertex or has no area. :func:`repair` mends the last.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        Mesh(3 vertices, 1 faces)
+    """
+
+    vertices: Float[np.ndarray, "n 3"]
+    """Positions, any unit of length."""
+    faces: Int[np.ndarray, "m 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
+
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+        """Copy, check and freeze the arrays."""
+        vertices, faces = checked_arrays(vertices, faces)
+        for reason, face in degenerate_faces(vertices, faces):
+            raise InputError(
+                f"face {face} {faces[face].tolist()} {reason}: drop such faces with "
+                "jd.repair((vertices, faces))"
+            )
+        for name, array in (("vertices", vertices), ("faces", faces)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.vertices)
+
+    @property
+    def n_faces(self) -> int:
+        """Number of faces."""
+        return len(self.faces)
+
+    @cached_property
+    def edges(self) -> Int[np.ndarray, "edges 2"]:
+        """Undirected edges (i < j), each once, sorted."""
+        return unique_edges(self.faces)
+
+    def __repr__(self) -> str:
+        """Return the sizes, not the arrays."""
+        return f"Mesh({self.n_vertices} vertices, {self.n_faces} faces)"
+
+
+def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies with valid shapes, finite vertices and indices in range, or raise."""
+    try:
+        points = np.array(vertices, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"vertices cannot be read as numbers: {error}") from error
+    try:
+        corners = np.array(faces, order="C")
+    except ValueError as error:
+        raise InputError(f"faces are no table of indices: {error}: give (m, 3)") from error
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise InputError(f"vertices have shape {points.shape}: give (n, 3) with n >= 1")
+    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
+        raise InputError(f"faces have shape {corners.shape}: give (m, 3) triangles with m >= 1")
+    if corners.dtype.kind not in "iu":
+        raise InputError(f"faces must be integers, got {corners.dtype}: give vertex indices")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} such): give finite positions"
+        )
+    corners = corners.astype(np.int64)
+    bad = np.flatnonzero(((corners < 0) | (corners >= len(points))).any(axis=1))
+    if bad.size:
+        raise InputError(
+            f"face {bad[0]} {corners[bad[0]].tolist()} names a vertex out of range: there are "
+            f"vertices 0 to {len(points) - 1}"
+        )
+    return points, corners
+
+
+def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, int]]:
+    """Return (reason, face) of the faces that repeat a vertex or have no area."""
+    repeats = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    found = [("repeats a vertex", int(k)) for k in np.flatnonzero(repeats)]
+    # Scaled, first as a whole and then per face, so that no size leaves the range of float64.
+    corner = (points / (np.abs(points).max() or 1.0))[faces]
+    u, v, w = (corner[:, i] - corner[:, j] for i, j in ((1, 0), (2, 0), (2, 1)))
+    longest = np.abs(np.concatenate([u, v, w], axis=1)).max(axis=1)
+    size = np.where(longest > 0, longest, 1.0)[:, None]
+    area = np.linalg.norm(np.cross(u / size, v / size), axis=1)
+    flat = (area <= _FLAT) & ~repeats
+    return found + [("has no area", int(k)) for k in np.flatnonzero(flat)]
+
+
+def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    # Encoded as one number a pair, because np.unique over rows is ten times slower.
+    n = int(faces.max()) + 1
+    code = np.unique(pairs[:, 0] * n + pairs[:, 1])
+    return np.stack([code // n, code % n], axis=1)
+
+
+def merge_equal_points(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct points in order of appearance, and for each old point its new index."""
+    points = points + 0.0  # makes -0.0 equal to 0.0
+    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return points[first[order]], rank[inverse.ravel()]
