@@ -22,17 +22,17 @@ from jaxdeform._baselines.skinning_weights import (
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
-from jaxdeform._deformation.problem import Problem, material, precompute
+from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
-from jaxdeform._deformation.solve import Result, Solution, deform, energy
+from jaxdeform._deformation.solve import Solution, deform, energy
 from jaxdeform._handles.files import HandleFile, load_handles
 from jaxdeform._handles.rigid import rigid_targets
 from jaxdeform._mesh.cells import Cells, rings, spokes
-from jaxdeform._mesh.files import check_output, load_mesh, load_rigidity, save_mesh
+from jaxdeform._mesh.files import load_mesh, load_rigidity, save_mesh
 from jaxdeform._mesh.inspection import Inspection, inspect, repair
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform._mesh.submesh import Part, cut
+from jaxdeform._mesh.submesh import Submesh, submesh
 from jaxdeform.errors import InputError
 from jaxdeform.estimation import (
     Estimate,
@@ -45,7 +45,8 @@ from jaxdeform.estimation import (
     find_handle_groups,
     find_handles,
 )
-from jaxdeform.plotting import picture
+from jaxdeform.plotting import render
+from jaxdeform.result import Result
 from jaxdeform.shapes import bend, rotate, translate, twist
 
 __all__ = [
@@ -63,7 +64,6 @@ __all__ = [
     "LaplacianEditor",
     "Mesh",
     "Newton",
-    "Part",
     "Problem",
     "QuasiNewton",
     "Result",
@@ -71,13 +71,12 @@ __all__ = [
     "RotationFit",
     "Skeleton",
     "Solution",
+    "Submesh",
     "ThesisEstimate",
     "Unrolled",
     "bend",
     "bounded_biharmonic_weights",
-    "check_output",
     "cotangent_weights",
-    "cut",
     "deform",
     "dual_quaternion_skinning",
     "energy",
@@ -96,19 +95,20 @@ __all__ = [
     "load_mesh",
     "load_rigidity",
     "load_skeleton",
-    "material",
     "mean_value_coordinates",
-    "picture",
     "precompute",
+    "render",
     "repair",
     "rigid_targets",
     "rigid_transforms",
     "rigid_weights",
+    "rigidity_from_material",
     "rings",
     "rotate",
     "save_mesh",
     "shapes",
     "spokes",
+    "submesh",
     "translate",
     "twist",
 ]

@@ -1,17 +1,17 @@
 """Arguments: read as arrays and checked, or refused by an InputError that names them."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 
-def known(x) -> bool:
+def is_concrete(x) -> bool:
     """Return whether an array's values can be read now (they cannot while JAX traces)."""
     return not isinstance(x, Tracer)
 
@@ -50,7 +50,7 @@ def read_positions(
     array = read_array(value, dtype, name)
     if array.shape != shape:
         raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
-    if known(array):
+    if is_concrete(array):
         bad = np.flatnonzero(~np.isfinite(np.asarray(array)).reshape(shape[0], -1).all(axis=1))
         if bad.size:
             raise InputError(f"{name} of {unit} {bad[0]} are not finite: give real positions")
@@ -100,22 +100,56 @@ def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     return given
 
 
-def check_components(mesh: Mesh, anchored: np.ndarray, referenced: np.ndarray) -> None:
-    """Raise InputError where a connected part of the mesh has no handle."""
-    n = mesh.n_vertices
-    i, j = mesh.edges.T
-    graph = sp.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
-    _, label = sp.csgraph.connected_components(graph, directed=False)
-    held = np.zeros(label.max() + 1, bool)
-    held[label[anchored]] = True
-    loose = np.flatnonzero(referenced & ~held[label])
+def check_components(mesh: Mesh, anchored: Int[np.ndarray, "anchored"]) -> None:
+    """Raise InputError where a connected component of the mesh has no handle."""
+    label = mesh.components
+    loose = np.flatnonzero(mesh.referenced & ~np.isin(label, label[anchored]))
     if loose.size:
         k = int(loose[0])
         size = int((label == label[k]).sum())
         raise InputError(
-            f"the connected part with vertex {k} ({size} vertices) has no handle, so it could lie "
-            "anywhere: add a handle there, or drop the part"
+            f"the connected component with vertex {k} ({size} vertices) has no handle, so it could "
+            "lie anywhere: add a handle there, or drop the component"
         )
+
+
+class HandleSplit(NamedTuple):
+    """The vertices of a mesh by what holds them."""
+
+    index: Int[np.ndarray, "handles"]
+    """The handles, in the order given."""
+    free: Bool[np.ndarray, "vertices"]
+    """True where a vertex moves: neither a hard handle nor without a face."""
+    soft: Float[np.ndarray, "vertices"]
+    """Weight of each soft handle, 0 elsewhere."""
+
+
+def split_handles(mesh: Mesh, handles: ArrayLike, handle_weights: ArrayLike) -> HandleSplit:
+    """Split the vertices into hard handles, soft handles and free ones, or raise InputError."""
+    index = check_handles(handles, mesh.n_vertices)
+    weights = check_handle_weights(handle_weights, index)
+    check_components(mesh, index[weights > 0])
+    is_soft = np.isfinite(weights)
+    free, soft = mesh.referenced.copy(), np.zeros(mesh.n_vertices)
+    free[index[~is_soft]] = False
+    soft[index[is_soft]] = weights[is_soft]
+    return HandleSplit(index, free, soft)
+
+
+def check_count(name: str, value: int, least: int = 1, most: int = 1_000_000) -> int:
+    """Return a whole number within bounds, or raise InputError naming the setting."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not least <= value <= most:
+        raise InputError(f"{name} is {value}: give a whole number from {least} to {most}")
+    return int(value)
+
+
+def check_tolerance(name: str, value: float) -> float:
+    """Return a finite number of 0 or more, or raise InputError naming the setting."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not number or not 0 <= value < np.inf:
+        raise InputError(f"{name} is {value}: give a finite number, 0 or more")
+    return float(value)
 
 
 def check_targets(targets: ArrayLike, count: int, dtype: np.dtype) -> Array | np.ndarray:
@@ -146,7 +180,7 @@ def check_rigidity(
         raise InputError(
             f"{name} has shape {array.shape}: give one number, or one per vertex, ({n},)"
         )
-    if known(array):
+    if is_concrete(array):
         values = np.atleast_1d(np.asarray(array))
         bad = np.flatnonzero(~((values >= 0) & np.isfinite(values)))
         if bad.size:

@@ -14,19 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.problem import Problem, material
+from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import deform
+from jaxdeform._linalg.cholesky import Factor, factorise
+from jaxdeform._linalg.ell import EllMatrix as Rows
 from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform.checks import as_array, check_positions, check_rigidity
-from jaxdeform.energy import Rows
-from jaxdeform.errors import InputError
-from jaxdeform.global_step import Factor, factorise
+from jaxdeform.errors import ArrayLike, InputError
 
 # Outside of these, as material constants (rigidity over tr(B) / 2), nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.
@@ -176,7 +176,7 @@ def estimate_rigidity(
     label = check_parts(np.zeros(n, int) if parts is None else parts, n)
     count = int(label.max()) + 1
     adjoint = adjoint or (Unrolled() if isinstance(solver, Alternating) else Implicit())
-    scale = np.asarray(material(problem, 1.0), np.float64)
+    scale = np.asarray(rigidity_from_material(problem, 1.0), np.float64)
     # A part is as large as its typical cell, and has a size even where its cells have no area.
     size = np.array([np.median(scale[label == k]) for k in range(count)])
     size = np.where(size > 0, size, scale.mean())
@@ -469,7 +469,7 @@ def estimate_rigidity_field(
     n, dtype = problem.n_vertices, problem.dtype
     poses = _check_poses(problem, observed, targets, mask)
     adjoint = adjoint or (Unrolled() if isinstance(solver, Alternating) else Implicit())
-    size = np.asarray(material(problem, 1.0), np.float64)
+    size = np.asarray(rigidity_from_material(problem, 1.0), np.float64)
     size = np.where(size > 0, size, size.mean())
     box = np.log([_SOFTEST * size, _STIFFEST * size])
     theta = np.clip(np.log(_check_start(start, np.full(n, 0.1 * np.median(size)))), *box)

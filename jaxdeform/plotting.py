@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from jaxdeform._mesh.files import check_place, write_beside
+from jaxdeform._mesh.files import check_place, write_atomically
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 
-def picture(
+def render(
     path: str | os.PathLike,
     mesh: Mesh,
     poses: Sequence[ArrayLike],
@@ -43,12 +42,12 @@ def picture(
         >>> import jaxdeform as jd, pathlib, tempfile
         >>> mesh = jd.shapes.square()
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "square.png"
-        >>> jd.picture(path, mesh, [mesh.vertices])
+        >>> jd.render(path, mesh, [mesh.vertices])
         >>> path.stat().st_size > 1000
         True
     """
     path = Path(path)
-    check_picture(path)
+    check_picture_path(path)
     import pyvista  # slow to import, and only needed here
     from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -91,10 +90,10 @@ def picture(
 
         Image.fromarray(image).save(name, format="PNG")
 
-    write_beside(path, write)
+    write_atomically(path, write)
 
 
-def check_picture(path: Path) -> None:
+def check_picture_path(path: Path) -> None:
     """Raise InputError if no picture could be written there."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: pictures are PNG files: use a .png name")

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 # ---------------------------------------------------------------- meshes
 

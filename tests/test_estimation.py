@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
-from conftest import EXACT, FD, ends, real_mesh
+from helpers import EXACT, FD, ends, real_mesh
 
 import jaxdeform as jd
 from jaxdeform._apps import cli

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from conftest import EXACT, ends
+from helpers import EXACT, ends
+from jaxdeform.energy import stiffness
 
 import jaxdeform as jd
 from jaxdeform import global_step
 from jaxdeform._deformation.initial_guess import normalised_laplacian
 from jaxdeform._linalg import nested_dissection
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
-from jaxdeform.energy import stiffness
 
 
 @pytest.fixture

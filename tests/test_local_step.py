@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import EXACT, FD
+from helpers import EXACT, FD
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 

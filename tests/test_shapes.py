@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import EXACT, FD, ends
+from helpers import EXACT, FD, ends
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd

@@ -23,10 +23,10 @@ from rich.table import Table
 jax.config.update("jax_enable_x64", True)
 
 import jaxdeform as jd  # noqa: E402 (after x64)
-from jaxdeform._mesh.files import check_place, write_beside  # noqa: E402
+from jaxdeform._mesh.files import check_output, check_place, write_atomically  # noqa: E402
 from jaxdeform.checks import check_rigidity  # noqa: E402
 from jaxdeform.estimation import check_parts  # noqa: E402
-from jaxdeform.plotting import check_picture  # noqa: E402
+from jaxdeform.plotting import check_picture_path  # noqa: E402
 
 app = typer.Typer(
     help="Deform triangle meshes whose parts differ in rigidity.",
@@ -89,7 +89,7 @@ def demo(
 ) -> None:
     """Bend a bar of two materials and write the deformed meshes and a picture."""
     _make_folder(out)
-    check_picture(out / "demo.png")
+    check_picture_path(out / "demo.png")
     mesh = jd.shapes.bar()
     y = mesh.vertices[:, 1]
     handles = np.flatnonzero((y < 6) | (y > 145))
@@ -118,7 +118,7 @@ def demo(
         poses.append(np.asarray(solution.vertices))
         jd.save_mesh(out / f"{name}.ply", mesh, vertices=poses[-1], rigidity=rigidity)
     console.print(table)
-    jd.picture(
+    jd.render(
         out / "demo.png",
         mesh,
         [mesh.vertices, *poses],
@@ -157,9 +157,9 @@ def deform(
     """Move the handles of a mesh and let the rest follow."""
     shape = jd.load_mesh(mesh)
     # Whatever can be wrong is found before the long work.
-    jd.check_output(out)
+    check_output(out)
     if picture is not None:
-        check_picture(picture)
+        check_picture_path(picture)
     held = jd.load_handles(handles, shape, motion)
     values = _rigidity(rigidity, shape)
     began = time.perf_counter()
@@ -182,7 +182,7 @@ def deform(
     if picture is not None:
         poses = [shape.vertices, np.asarray(solution.vertices)]
         colors = [None, values] if values.ndim else []
-        jd.picture(picture, shape, poses, titles=["rest", "deformed"], values=colors)
+        jd.render(picture, shape, poses, titles=["rest", "deformed"], values=colors)
         console.print(f"wrote {picture}")
 
 
@@ -212,7 +212,7 @@ def estimate(
 ) -> None:
     """Estimate how rigid a mesh or its parts are, from deformed poses."""
     shape = jd.load_mesh(rest)
-    jd.check_output(out)
+    check_output(out)
     report = out.with_suffix(".json")
     if out.suffix.lower() != ".ply":
         raise jd.InputError(f"{out}: only PLY carries rigidity per vertex: use a .ply name")
@@ -250,7 +250,7 @@ def estimate(
     console.print(str(fit.result))
     jd.save_mesh(out, shape, rigidity=fit.field)
     text = json.dumps(_as_json(fit, held), indent=1, allow_nan=False)
-    write_beside(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
+    write_atomically(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
     console.print(f"wrote {out} and {report}")
 
 

@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 
 def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "n m"]:

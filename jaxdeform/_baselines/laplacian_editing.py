@@ -1,54 +1,44 @@
 """Laplacian mesh editing: the baseline of Eq. 3.2."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import ArrayLike
 
-from jaxdeform._deformation.initial_guess import normalised_laplacian
+from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
+from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.cells import spokes
+from jaxdeform._mesh.laplacian import normalised_laplacian
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.checks import (
-    check_components,
-    check_handle_weights,
-    check_handles,
-    check_targets,
-    known,
-)
-from jaxdeform.energy import Rows
-from jaxdeform.errors import InputError
-from jaxdeform.global_step import Anchor, Factor, NotPositiveDefinite, factorise
+from jaxdeform.checks import check_targets, split_handles
+from jaxdeform.errors import ArrayLike, InputError
 
 
 class LaplacianEditor(eqx.Module):
-    """Laplacian editing, factored for one mesh and handle set; call it with targets (h, 3)."""
+    """Laplacian editing, factored for one mesh and handle set; call it with targets (handles, 3).
 
-    rest: Float[Array, "n 3"]
-    handles: Int[np.ndarray, "h"]
+    Its columns are the vertices (three right-hand sides), or all coordinates (one right-hand side)
+    where the details follow as similarities.
+    """
+
+    rest: Float[Array, "vertices 3"]
+    handles: Int[np.ndarray | Array, "handles"]
     free: Bool[Array, "columns"]
     soft: Float[Array, "columns"]
     pull: Float[Array, "rows columns"]
-    """L^T delta: what the details ask for; zero where the similarity carries them."""
-    normal: Rows
+    """L^T delta, what the details ask for; zero where the similarities carry them."""
+    normal: EllMatrix
     factor: Factor
-    anchor: Anchor = eqx.field(static=True, repr=False)
 
-    def __call__(self, targets: ArrayLike) -> Float[Array, "n 3"]:
+    def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
         """Return the edited positions. Differentiable to the targets."""
         targets = check_targets(targets, len(self.handles), self.rest.dtype)
-        held = self.rest.at[self.handles].set(targets)
-        # Columns are vertices (three right-hand sides), or all 3n coordinates (one).
-        x = held.T.reshape(self.pull.shape)
+        x = self.rest.at[self.handles].set(targets).T.reshape(self.pull.shape)
         fixed = jnp.where(self.free[None], 0.0, x)
         right = self.pull + self.soft[None] * x - self.normal.apply(fixed)
-        out = (fixed + self.factor.solve(jnp.where(self.free[None], right, 0.0))).reshape(3, -1).T
-        if known(out):
-            # The host's factor lives as long as the editor; do not outrun it.
-            jax.block_until_ready(out)
-        return out
+        solution = self.factor.solve(jnp.where(self.free[None], right, 0.0))
+        return (fixed + solution).reshape(3, -1).T
 
 
 def laplacian_editor(
@@ -83,16 +73,9 @@ def laplacian_editor(
         (722, 3)
     """
     n = mesh.n_vertices
-    index = check_handles(handles, n)
-    pulls = check_handle_weights(handle_weights, index)
-    referenced = np.zeros(n, bool)
-    referenced[mesh.faces.ravel()] = True
-    check_components(mesh, index[pulls > 0], referenced)
+    index, free, soft = split_handles(mesh, handles, handle_weights)
     cells = spokes(mesh, weights=weights)
-    laplacian = normalised_laplacian(cells)
-    free, soft = referenced.copy(), np.zeros(n)
-    free[index[np.isinf(pulls)]] = False
-    soft[index[np.isfinite(pulls)]] = pulls[np.isfinite(pulls)]
+    laplacian = normalised_laplacian(cells.edges, cells.weights, n)
     if similarity:
         operator = sp.kron(sp.identity(3), laplacian) - _turned_details(mesh, laplacian)
         pull = np.zeros((1, 3 * n))
@@ -104,7 +87,7 @@ def laplacian_editor(
     normal = (operator.T @ operator + sp.diags(soft)).tocsr()
     dtype = np.dtype(jnp.result_type(float))
     try:
-        factor, held = factorise(normal, free, dtype, positions=positions)
+        factor = factorise(normal, free, dtype, positions=positions)
     except NotPositiveDefinite as error:
         raise InputError(
             "the handles do not determine the shape: hold at least three vertices that are not on "
@@ -116,9 +99,8 @@ def laplacian_editor(
         free=jnp.asarray(free),
         soft=jnp.asarray(soft, dtype),
         pull=jnp.asarray(pull, dtype),
-        normal=Rows.build([normal], dtype),
+        normal=EllMatrix.build([[normal]], dtype),
         factor=factor,
-        anchor=Anchor(held),
     )
 
 

@@ -3,15 +3,14 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from jaxdeform._linalg.rotations import (
     matrices_from_quaternions,
     quaternion_product,
     quaternions_from_matrices,
 )
-from jaxdeform.checks import as_array, check_positions, known, rows_of_three
-from jaxdeform.errors import InputError
+from jaxdeform.checks import as_array, check_positions, rows_of_three
+from jaxdeform.errors import ArrayLike, InputError
 from jaxdeform.shapes import rotation_matrices
 
 
@@ -129,7 +128,7 @@ def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
             f"weights have shape {weights.shape}: give ({len(vertices)}, m), vertices by controls"
         )
     weights = check_positions("weights", weights, weights.shape, dtype)
-    if known(weights):
+    if is_concrete(weights):
         total = np.asarray(weights).sum(axis=1)
         bad = np.flatnonzero(np.abs(total - 1.0) > _LOOSE)
         if bad.size:
@@ -142,7 +141,7 @@ def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
 
 
 def _check_blendable(weights: Array, transforms: Array) -> None:
-    if known(weights):
+    if is_concrete(weights):
         low = np.asarray(weights).min(axis=1, initial=0.0)
         bad = np.flatnonzero(low < -_LOOSE)
         if bad.size:
@@ -150,7 +149,7 @@ def _check_blendable(weights: Array, transforms: Array) -> None:
                 f"a weight of vertex {bad[0]} is {low[bad[0]]:.6g}: dual quaternions blend between "
                 "motions only; give weights of 0 or more, or use linear_blend_skinning"
             )
-    if known(transforms):
+    if is_concrete(transforms):
         turn = np.asarray(transforms)[:, :, :3]
         gap = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max(axis=(1, 2))
         bad = np.flatnonzero((gap > _LOOSE) | (np.linalg.det(turn) < 0))

@@ -4,9 +4,7 @@ import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform.checks import (
@@ -15,10 +13,10 @@ from jaxdeform.checks import (
     check_groups,
     check_handles,
     check_positions,
-    known,
+    is_concrete,
     rows_of_three,
 )
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 
 def rigid_weights(
@@ -72,7 +70,7 @@ def inverse_distance_weights(
     """
     squares = _squares(vertices, controls, distances)
     power = as_array(power, squares.dtype, "power")
-    if power.ndim or (known(power) and not (0 < float(power) < np.inf)):
+    if power.ndim or (is_concrete(power) and not (0 < float(power) < np.inf)):
         raise InputError(f"power is {power}: give one finite number above 0")
     on = squares == 0
     # A softmax of logarithms, because 1 / d^power overflows for small d.
@@ -103,9 +101,7 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "n m
     used = np.unique(faces)
     if not (igl.is_edge_manifold(faces)[0] and np.ravel(igl.is_vertex_manifold(faces))[used].all()):
         raise InputError("geodesic distances need a manifold surface: see jd.inspect(mesh)")
-    i, j = mesh.edges.T
-    graph = sp.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(mesh.n_vertices,) * 2)
-    _, label = sp.csgraph.connected_components(graph, directed=False)
+    label = mesh.components
     out = np.full((mesh.n_vertices, len(index)), np.inf)
     none = np.array([], np.int64)
     for k, source in enumerate(index):
@@ -149,14 +145,12 @@ def bounded_biharmonic_weights(
     empty = np.setdiff1d(np.arange(count), group)
     if empty.size:
         raise InputError(f"group {empty[0]} has no handles: number the groups 0 to m - 1")
-    referenced = np.zeros(mesh.n_vertices, bool)
-    referenced[mesh.faces.ravel()] = True
-    if not referenced.all():
+    if not mesh.referenced.all():
         raise InputError(
-            f"vertex {np.flatnonzero(~referenced)[0]} belongs to no face, so no weight reaches "
-            "it: drop such vertices with jd.repair(mesh)"
+            f"vertex {np.flatnonzero(~mesh.referenced)[0]} belongs to no face, so no weight "
+            "reaches it: drop such vertices with jd.repair(mesh)"
         )
-    check_components(mesh, index, referenced)
+    check_components(mesh, index)
     # To unit size, because libigl's tolerances are absolute.
     points = mesh.vertices - mesh.vertices.mean(axis=0)
     points = points / np.abs(points).max()
@@ -188,7 +182,7 @@ def _squares(vertices, controls, distances) -> Float[Array, "n m"]:
         return jnp.sum((vertices[:, None] - ends[None]) ** 2, axis=2)
     along = ends[:, 1] - ends[:, 0]
     square = jnp.sum(along**2, axis=1)
-    if known(square) and not np.asarray(square).all():
+    if is_concrete(square) and not np.asarray(square).all():
         raise InputError(
             f"bone {np.flatnonzero(np.asarray(square) == 0)[0]} has length zero: give two "
             "different ends, or points (m, 3)"
@@ -205,7 +199,7 @@ def _given_squares(distances: Array, shape: tuple[int, int]) -> Float[Array, "n 
         raise InputError(
             f"distances have shape {distances.shape}, expected {shape}: vertices by controls"
         )
-    if known(distances):
+    if is_concrete(distances):
         values = np.asarray(distances)
         bad = np.argwhere(~(values >= 0))
         if bad.size:

@@ -1,88 +1,136 @@
-"""How derivatives go through the iterations: unrolled, or by the implicit function theorem."""
+"""How derivatives are made: through the iterations, or from the fixed point alone."""
 
 from dataclasses import dataclass
-from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxdeform._deformation.alternating import alternate
+from jaxdeform._deformation.descent import Descent, Solver
 from jaxdeform._deformation.problem import System
-from jaxdeform._deformation.quasi_newton import QuasiNewton
-from jaxdeform._deformation.reduced_energy import Held, evaluate_lanes
-from jaxdeform._linalg.lbfgs import Settings, minimize
+from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform.checks import check_count, check_tolerance
+from jaxdeform.errors import InputError
 
 
 @dataclass(frozen=True)
 class Unrolled:
     """Differentiate through the iterations, which are recomputed step by step (checkpointed).
 
-    Exact for the number of steps taken, converged or not; memory grows by one mesh a step.
+    Exact for the number of steps taken, converged or not. Memory grows by one mesh a step.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.Unrolled()
+        Unrolled()
     """
+
+    needs_one_energy: ClassVar[bool] = False
+
+    def check(self, solver: Solver) -> None:
+        """Raise InputError if the solver's loop has no reverse mode."""
+        if not solver.can_unroll:
+            raise InputError(
+                "Unrolled() differentiates the thesis's iterations: use it with "
+                f"solver=Alternating(), or Implicit() with {type(solver).__name__}()"
+            )
+
+    def solve(
+        self,
+        solver: Solver,
+        energy: ReducedEnergy,
+        system: System,
+        inputs: Inputs,
+        start: Float[Array, "3 vertices"],
+    ) -> Descent:
+        """Run the solver; JAX differentiates its loop."""
+        return solver.minimize(energy, system, inputs, start)
 
 
 @dataclass(frozen=True)
 class Implicit:
     """Differentiate the fixed point instead of the path: memory independent of the step count.
 
-    Right once the iteration has converged. The linear system is solved by conjugate gradients,
-    preconditioned with the factor of A that is there already.
+    Right once the iteration has converged. The implicit function theorem on grad E(p) = 0 gives
+    ``H dp = -(d grad E / d inputs) dinputs``. The Hessian H = A - K^T dT/dC K is symmetric, so one
+    conjugate gradient method, preconditioned with the factor of A, serves forward and reverse mode.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.Implicit(tolerance=1e-6).max_steps
+        500
     """
 
     tolerance: float = 1e-10
-    """Relative residual of the linear system (no less than the precision allows)."""
+    """Relative residual of the linear system (but no less than the precision allows)."""
     max_steps: int = 500
+    """Most steps of conjugate gradients."""
 
+    needs_one_energy: ClassVar[bool] = True
 
-def solve_implicit(system: System, held: Held, p, evaluate, solver, adjoint: Implicit):
-    """Solve by any method, and differentiate grad E(p) = 0 at the end (implicit function).
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_tolerance("tolerance of Implicit", self.tolerance)
+        check_count("max_steps of Implicit", self.max_steps)
 
-    ``H dp = -(d grad E / d held) dheld``. The Hessian H = A - K^T dT/dC K is symmetric, so the same
-    conjugate gradients serve jvp and vjp. (lax.custom_root would do it too, but traces the
-    derivatives even where nobody asks for any: 0.7 s.)
-    """
+    def check(self, solver: Solver) -> None:
+        """Accept every solver."""
 
-    @jax.custom_jvp
-    def root(system, held, p):
-        if isinstance(solver, QuasiNewton):
-            lanes = partial(evaluate_lanes, evaluate)
-            p, known, history, steps, converged = minimize(
-                lanes, system, held, p, Settings(solver.tolerance, solver.max_steps, solver.memory)
-            )
-            code = jnp.where(converged, 1, 2)
-        else:
-            p, known, history, steps, code = alternate(system, held, p, evaluate, solver)
-        # As floats, because the tangents of integers are of a type of their own.
-        return p, known, history, steps.astype(p.dtype), code.astype(p.dtype)
+    def solve(
+        self,
+        solver: Solver,
+        energy: ReducedEnergy,
+        system: System,
+        inputs: Inputs,
+        start: Float[Array, "3 vertices"],
+    ) -> Descent:
+        """Run the solver on constants, and give its end the derivative of the fixed point."""
+        end = solver.minimize(energy, *jax.lax.stop_gradient((system, inputs, start)))
+        end = jax.lax.stop_gradient(end)
+        p = self._with_implicit_derivative(energy, system, inputs, end.positions, end.transforms)
+        return end._replace(positions=p)
 
-    @root.defjvp
-    def root_jvp(primals, tangents):
-        system, held, start = primals
-        solution = root(system, held, start)
-        p, known, *rest = solution
+    def _with_implicit_derivative(self, energy: ReducedEnergy, system, inputs, p, transforms):
+        """Return p, known to be the minimiser for these inputs, with the derivatives of that.
 
-        def gradient(free, held):
-            moved = jnp.where(system.free[None], free, held.targets)
-            return evaluate(system, held, p=moved, known=known).gradient
+        (lax.custom_root would do it too, but it traces the derivatives even where nobody asks for
+        any: 0.7 s.)
+        """
 
+        @jax.custom_jvp
+        def minimiser(system, inputs, p, transforms):
+            del system, inputs, transforms
+            return p
+
+        @minimiser.defjvp
+        def minimiser_jvp(primals, tangents):
+            system, inputs, p, transforms = primals
+            p = minimiser(system, inputs, p, transforms)  # so that this rule has derivatives too
+
+            def gradient(free, inputs):
+                moved = jnp.where(system.free[None], free, inputs.targets)
+                return energy.evaluate(system, inputs, moved, transforms).gradient
+
+            _, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
+            _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
+            move = self._solve_hessian(system, hessian, -right)
+            return p, jnp.where(system.free[None], move, tangents[1].targets)
+
+        return minimiser(system, inputs, p, transforms)
+
+    def _solve_hessian(self, system: System, hessian, right):
         def keep(x):  # the unknowns are the free vertices; elsewhere the system is the identity
             return jnp.where(system.free[None], 0.0, x)
 
         def conjugate_gradients(matvec, b):
-            tolerance = max(adjoint.tolerance, 20 * float(jnp.finfo(b.dtype).eps))
+            tolerance = max(self.tolerance, 20 * float(jnp.finfo(b.dtype).eps))
             precondition = lambda r: system.factor.solve(r) + keep(r)  # noqa: E731
-            x, _ = jax.scipy.sparse.linalg.cg(
-                matvec, b, tol=tolerance, maxiter=adjoint.max_steps, M=precondition
+            solution, _ = jax.scipy.sparse.linalg.cg(
+                matvec, b, tol=tolerance, maxiter=self.max_steps, M=precondition
             )
-            return x
+            return solution
 
-        _, hessian = jax.linearize(lambda x: gradient(x, held), p)
-        _, right = jax.jvp(lambda held: gradient(p, held), (held,), (tangents[1],))
-        move = jax.lax.custom_linear_solve(
-            lambda x: hessian(x) + keep(x), -right, conjugate_gradients, symmetric=True
+        return jax.lax.custom_linear_solve(
+            lambda x: hessian(x) + keep(x), right, conjugate_gradients, symmetric=True
         )
-        move = jnp.where(system.free[None], move, tangents[1].targets)
-        return solution, (move, *jax.tree.map(jnp.zeros_like, [known, *rest]))
-
-    p, known, history, steps, code = root(system, held, jax.lax.stop_gradient(p))
-    return p, known, history, steps.astype(jnp.int32), code.astype(jnp.int32)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdeform._linalg.small_matrices import Grid, product, transpose
+from jaxdeform._linalg.small_matrices import Grid, minus_identity, product, transpose
 
 
 def cell_energy(t, c, b, lam):
@@ -13,6 +13,7 @@ def cell_energy(t, c, b, lam):
 
 
 def half_gradient(x: Grid, m: Grid, b: list[Array], lam: Array) -> Grid:
+    """Half the gradient of phi at X: ``2 lambda X (X^T X - I) + X B - M^T`` (Eq. 4.3)."""
     gram = product(transpose(x), x)
     middle = [
         [
@@ -45,3 +46,20 @@ def half_hessian(x: Grid, b: list[Array], lam: Array) -> list[list[Array]]:
                         row.append(2.0 * lam * value)
             rows.append(row)
     return rows
+
+
+def half_hessian_product(x: Grid, b: list[Array], lam: Array, v: Grid) -> Grid:
+    """Half the Hessian of phi at X times a direction V.
+
+    ``2 lambda (V (X^T X - I) + X X^T V + X V^T X) + V B``.
+    """
+    gram = minus_identity(product(transpose(x), x))
+    terms = (
+        product(v, gram),
+        product(product(x, transpose(x)), v),
+        product(x, product(transpose(v), x)),
+    )
+    return [
+        [2.0 * lam * sum(term[i][j] for term in terms) + v[i][j] * b[j] for j in range(3)]
+        for i in range(3)
+    ]

@@ -1,7 +1,7 @@
 """The local step: the transformation of each cell, given the deformed vertices (Sec. 4.1.1).
 
-Every solver here minimises, for each cell on its own (Eq. 4.2, in the cell's principal frame,
-where B is diagonal; energy.py),
+Every solver here minimises, for each cell on its own (Eq. 4.2, in the cell's principal axes, where
+B is diagonal; covariance.py),
 
     phi(T) = lambda |T^T T - I|^2 + tr(T B T^T) - 2 tr(T C).
 
@@ -17,16 +17,21 @@ against the alternatives in docs/benchmarks.md.
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from jaxdeform._deformation.cell_energy import cell_energy, half_hessian
+from jaxdeform._deformation.cell_energy import cell_energy, half_hessian, half_hessian_product
 from jaxdeform._deformation.cell_newton import block_newton, exact_newton, gradient_tolerance
-from jaxdeform._linalg.rotations import attach_rotation, polar_rotation, polar_rotation_of_grid
+from jaxdeform._linalg.rotations import (
+    polar_rotation,
+    polar_rotation_of_grid,
+    rotation_with_derivative,
+)
 from jaxdeform._linalg.small_matrices import (
+    Grid,
     Matrices,
     Scalars,
     Vectors,
@@ -40,43 +45,60 @@ from jaxdeform._linalg.small_matrices import (
 from jaxdeform._linalg.subset import on_few
 
 
+@runtime_checkable
 class LocalStep(Protocol):
-    """What ``deform(..., local=)`` takes: one of the five solvers of this file."""
+    """What ``deform(..., local=)`` takes: how the transformation of each cell is found.
+
+    All arrays have the cells on their last axis and are in the cell's principal axes, where B is
+    diagonal. A local step is a setting: it must be hashable (a frozen dataclass is). See
+    docs/derivatives.md for a complete example of one's own.
+    """
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-        """Return T (deformed axis, rest axis, cell) for C, diagonal B and lambda."""
+        """Return T for C, the principal moments b and lambda.
+
+        **Arguments**: c (3, 3, cells), (rest axis, deformed axis, cell); b (3, cells); rigidity
+        (cells,). **Returns** T (3, 3, cells), (deformed axis, rest axis, cell).
+        """
         ...
 
-    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    def with_implicit_derivative(
+        self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
+    ) -> Matrices:
         """Return t, known to be ``minimize(c, b, rigidity)``, with the derivatives of that."""
         ...
 
 
-def fit(local: LocalStep, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-    """Run a local step; its iterations are not differentiated, its solution is."""
-    t = _over_lanes(local)(*map(jax.lax.stop_gradient, (c, b, rigidity)))
-    return local.attach(t, c, b, rigidity)
+def check_local_step(local: LocalStep) -> None:
+    """Raise InputError unless this is a local step."""
+
+
+def solve_local_step(local: LocalStep, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    """Run a local step. Its iterations are not differentiated; its solution is."""
+    t = _over_batch(local)(*map(jax.lax.stop_gradient, (c, b, rigidity)))
+    return local.with_implicit_derivative(t, c, b, rigidity)
 
 
 @cache
-def _over_lanes(local: LocalStep):
-    """Return ``local.minimize`` with a vmap of its own: the lanes' cells become one list of cells.
+def _over_batch(local: LocalStep):
+    """Return ``local.minimize`` with a vmap of its own: a batch becomes one longer list of cells.
 
-    Cells do not know of each other, so lanes are only more of them. Under the general rule every
-    lane would run whatever any lane needs, such as the exact steps of a few cells: 64 bars took
-    4 times as long a lane as one bar alone.
+    Cells do not know of each other. Under the general rule every member of a batch would run
+    whatever any member needs, such as the exact steps of a few cells: 64 bars took 4 times as long
+    per bar as one bar alone.
     """
     minimize = custom_vmap(local.minimize)
 
     @minimize.def_vmap
-    def rule(lanes, batched, *data):
-        n = data[0].shape[-1]
-        spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (lanes, *x.shape))  # noqa: E731
-        flat = [
-            jnp.moveaxis(spread(x, is_), 0, -1).reshape(*x.shape[is_:-1], n * lanes)
-            for x, is_ in zip(data, batched, strict=True)
-        ]
-        return jnp.moveaxis(minimize(*flat).reshape(3, 3, n, lanes), -1, 0), True
+    def rule(size, is_batched, *data):
+        cells = data[0].shape[-1]
+
+        def flatten(x, batched):
+            x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
+            return jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], cells * size)
+
+        flat = [flatten(x, batched) for x, batched in zip(data, is_batched, strict=True)]
+        return jnp.moveaxis(minimize(*flat).reshape(3, 3, cells, size), -1, 0), True
 
     return minimize
 
@@ -84,17 +106,19 @@ def _over_lanes(local: LocalStep):
 class _Material:
     """Solvers of Eq. 4.2 share the derivative of its solution."""
 
-    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    def with_implicit_derivative(
+        self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
+    ) -> Matrices:
         """Return t with the derivatives of the minimiser (implicit function theorem)."""
-        return _attach_material(t, c, b, rigidity)
+        return _material_with_derivative(t, c, b, rigidity)
 
 
 @dataclass(frozen=True)
 class Newton(_Material):
     """Damped Newton on the exact gradient (Eq. 4.3) and Hessian; never raises the energy.
 
-    First quasi-Newton steps with the block diagonal of the Hessian, which in the principal frame is
-    nearly all of it (three scalars and three 2x2 blocks); then, on the few cells that this does not
+    First quasi-Newton steps with the block diagonal of the Hessian, which in principal axes is
+    nearly all of it (three scalars and three 2x2 blocks). Then, on the few cells that this does not
     solve, exact 9x9 steps.
     """
 
@@ -107,9 +131,9 @@ class Newton(_Material):
         m = product(as_grid(c), rotation)
         m = [[m[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]  # C R = U S U^T
         data = m, list(b), rigidity, gradient_tolerance(m, rigidity)
-        x, hard = block_newton(*data)
-        few = max(64, hard.shape[0] // 64)
-        x = on_few(partial(exact_newton, self.max_steps), hard, few, x, *data)
+        x, unsolved = block_newton(*data)
+        few = max(64, unsolved.shape[0] // 64)
+        x = on_few(partial(exact_newton, self.max_steps), unsolved, few, x, *data)
         return from_grid(product(rotation, x))
 
 
@@ -120,7 +144,7 @@ class LBFGS(_Material):
     With the backtracking line search, which is six times faster here than jaxopt's default one.
     """
 
-    tol: float = 1e-10
+    tolerance: float = 1e-10
     """Stop at this gradient norm, relative to the cell's size."""
     max_steps: int = 200
 
@@ -130,7 +154,7 @@ class LBFGS(_Material):
 
         solver = jaxopt.LBFGS(
             cell_energy,
-            tol=self.tol,
+            tol=self.tolerance,
             maxiter=self.max_steps,
             linesearch="backtracking",
             maxls=8,
@@ -179,10 +203,12 @@ class RotationFit:
         del b, rigidity
         return polar_rotation(c)
 
-    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    def with_implicit_derivative(
+        self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
+    ) -> Matrices:
         """Return t with the derivatives of the polar rotation."""
         del b, rigidity
-        return attach_rotation(t, c)
+        return rotation_with_derivative(t, c)
 
 
 @dataclass(frozen=True)
@@ -202,25 +228,28 @@ class AffineFit:
         pull = (b + floor)[None]
         return (jnp.swapaxes(c, 0, 1) + floor[None] * rotation) / pull
 
-    def attach(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    def with_implicit_derivative(
+        self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
+    ) -> Matrices:
         """Return t with the derivatives of the linear fit, those of lambda = 0."""
-        return _attach_material(t, c, b, jnp.zeros_like(rigidity))
+        return _material_with_derivative(t, c, b, jnp.zeros_like(rigidity))
 
 
 @jax.custom_jvp
-def _attach_material(t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+def _material_with_derivative(t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
     del c, b, rigidity
     return t
 
 
-@_attach_material.defjvp
-def _attach_material_jvp(primals, tangents):
+@_material_with_derivative.defjvp
+def _material_with_derivative_jvp(primals, tangents):
     """Differentiate the condition grad phi(T) = 0 instead of the iterations.
 
     ``H dT = dC^T - T dB - 2 (T T^T T - T) dlambda`` with H half the Hessian. A prototype that
     differentiated the iterations took 40 s to compile.
     """
     t, c, b, rigidity = primals
+    t = _material_with_derivative(t, c, b, rigidity)  # so that this rule has derivatives too
     _, dc, db, dlam = tangents
     tg = as_grid(t)
     gram = product(transpose(tg), tg)
@@ -229,11 +258,27 @@ def _attach_material_jvp(primals, tangents):
         [dc[j, i] - tg[i][j] * db[j] - 2.0 * excess[i][j] * dlam for j in range(3)]
         for i in range(3)
     ]
-    hessian = half_hessian(tg, list(b), rigidity)
     scale = rigidity + jnp.max(jnp.abs(b), axis=0)
     floor = jnp.finfo(c.dtype).eps * scale + jnp.finfo(c.dtype).tiny
-    solution = ldl_solve(hessian, [v for row in right for v in row], floor)
-    return t, from_grid([[solution[3 * i + j] for j in range(3)] for i in range(3)])
+    return t, _solve_hessian(tg, b, rigidity, floor, from_grid(right))
+
+
+def _solve_hessian(x: Grid, b: Vectors, rigidity: Scalars, floor: Scalars, right: Matrices):
+    """Solve H dT = right in every cell.
+
+    As a linear solve of its own, so that derivatives of second order solve again instead of
+    differentiating the 9x9 elimination, which takes minutes to compile.
+    """
+
+    def apply(v: Matrices) -> Matrices:
+        return from_grid(half_hessian_product(x, list(b), rigidity, as_grid(v)))
+
+    def solve(_, r: Matrices) -> Matrices:
+        entries = [r[i, j] for i in range(3) for j in range(3)]
+        solution = ldl_solve(half_hessian(x, list(b), rigidity), entries, floor)
+        return from_grid([solution[3 * i : 3 * i + 3] for i in range(3)])
+
+    return jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)
 
 
 def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:

@@ -3,10 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from jaxdeform.checks import as_array, check_groups, check_positions
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 from jaxdeform.shapes import rotation_matrices
 
 

@@ -1,12 +1,13 @@
-"""Preconditioned L-BFGS on the reduced energy, for one deformation or a queue of them.
+"""Preconditioned L-BFGS for one minimisation or a queue of them.
 
-The minimiser behind :class:`QuasiNewton`. It knows of meshes only that positions are (3, n) and
-that A^-1 is there to precondition with.
+The engine behind :class:`QuasiNewton`. All it knows of meshes is that positions are (3, vertices)
+and that A^-1 is there to precondition with.
 
-Lanes and slots. Under vmap the general rule for loops would run all lanes until the slowest is
-done, and choose between old and new values of everything in every turn (measured on 64 bars of
-which the slowest takes twice the mean: 6 times a single one's time per lane). Here the lanes are a
-queue instead: a few slots iterate together, and a slot whose lane is done takes the next one.
+A queue, not a common loop. Under vmap the general rule for loops runs every member of the batch
+until the slowest is done, and selects between old and new values of everything in every iteration:
+with 64 bars, of which the slowest takes twice the mean, 6 times as long per bar as one bar alone.
+Here the batch is a queue instead. A few slots iterate together, and a slot whose member is done
+takes the next one.
 """
 
 from collections.abc import Callable
@@ -18,14 +19,16 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform.global_step import has_accelerator
+from jaxdeform._linalg.cholesky import has_accelerator
+from jaxdeform._linalg.xla import after_reads, without_fusion
 
-# Lanes that iterate together. More would wait more for each other at the end, and outgrow the
-# caches; fewer would leave the cores idle (a lane of 64 bars: 10.5, 10.3, 11.2, 13.7 and 16.1 ms
-# with 8, 12, 16, 24 and 32 slots. Going on with 4 once no lanes are left takes a tenth off, and
-# compiles twice as long).
+# Slots: members of the batch that iterate together. More slots wait longer for each other at the
+# end and outgrow the caches; fewer leave the cores idle. Each of 64 bars takes 10.5, 10.3, 11.2,
+# 13.7 and 16.1 ms with 8, 12, 16, 24 and 32 slots. Going down to 4 slots once the queue is empty
+# would take a tenth off, and twice as long to compile.
 SLOTS = 12
-# On an accelerator, as many lanes as have this many vertices together, which fills it; their arrays
+
+# On an accelerator, as many slots as have this many vertices together, which fills it. Their arrays
 # then take about 4 GB in float64. (Reasoned, not measured: no accelerator was at hand.)
 VERTICES_AT_ONCE = 1 << 22
 
@@ -35,25 +38,25 @@ class Settings(NamedTuple):
 
     tolerance: float
     max_steps: int
-    memory: int
+    history_length: int
 
 
 class Sample(NamedTuple):
-    """What one evaluation at p tells, in one or in several lanes."""
+    """What one evaluation at p tells, for one p or for a batch of them."""
 
-    transforms: Float[Array, "3 3 n *w"]
-    gradient: Float[Array, "3 n *w"]
+    transforms: Float[Array, "3 3 vertices *w"]
+    gradient: Float[Array, "3 vertices *w"]
     """Half the gradient of the reduced energy, 0 at fixed vertices: A p - K^T T."""
     energy: Float[Array, "*w"]
     rounding: Float[Array, "*w"]
     """Two energies closer than this differ by rounding alone."""
 
 
-class Descent(NamedTuple):
-    """Where a descent ended."""
+class Minimum(NamedTuple):
+    """Where a minimisation ended."""
 
-    p: Float[Array, "3 n"]
-    transforms: Float[Array, "3 3 n"]
+    p: Float[Array, "3 vertices"]
+    transforms: Float[Array, "3 3 vertices"]
     energy: Float[Array, "history"]
     """At the start and after each step; anything behind the last."""
     steps: Int[Array, ""]
@@ -72,33 +75,33 @@ def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."
 def minimize(
     evaluate: Callable[[Any, Any, Array], Sample],
     system: Any,
-    held: Any,
-    start: Float[Array, "3 n"],
+    inputs: Any,
+    start: Float[Array, "3 vertices"],
     settings: Settings,
-) -> Descent:
-    """Minimise from a start; under vmap over ``held`` and ``start``, lane by lane in slots.
+) -> Minimum:
+    """Minimise from a start; under vmap over ``inputs`` and ``start``, as a queue through slots.
 
-    ``evaluate(system, held, p)`` tells of the p of several slots, which are the last axis of all it
-    takes and returns; ``system.factor.solve`` is A^-1.
+    ``evaluate(system, inputs, p)`` evaluates a batch, which is the last axis of all it takes and
+    returns. ``system.factor.solve`` is A^-1.
     """
 
     @custom_vmap
-    def lanes(system, held, start):
-        return _run_queue(evaluate, system, held, start, settings)
+    def batch(system, inputs, start):
+        return _run_queue(evaluate, system, inputs, start, settings)
 
-    @lanes.def_vmap
-    def more_lanes(size, batched, system, *own):
-        if any(jax.tree.leaves(batched[0])):
+    @batch.def_vmap
+    def larger_batch(size, is_batched, system, *own):
+        if any(jax.tree.leaves(is_batched[0])):
             raise NotImplementedError("vmap over problems: they differ in structure; loop instead")
         spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
-        own = jax.tree.map(spread, own, tuple(batched[1:]))
+        own = jax.tree.map(spread, own, tuple(is_batched[1:]))
         each = own[-1].shape[1]
         flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
-        out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), lanes(system, *flat))
+        out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), batch(system, *flat))
         return out, jax.tree.map(lambda _: True, out)
 
-    one = jax.tree.map(lambda x: x[None], (held, start))
-    return jax.tree.map(lambda x: x[0], lanes(system, *one))
+    one = jax.tree.map(lambda x: x[None], (inputs, start))
+    return jax.tree.map(lambda x: x[0], batch(system, *one))
 
 
 class _Memory(NamedTuple):
@@ -108,8 +111,8 @@ class _Memory(NamedTuple):
     the oldest to the newest, so that a direction costs two passes over each large array.
     """
 
-    s: Float[Array, "w m 3 n"]
-    z: Float[Array, "w m 3 n"]
+    s: Float[Array, "w m 3 vertices"]
+    z: Float[Array, "w m 3 vertices"]
     filled: Bool[Array, "w m"]
     sy: Float[Array, "w m m"]
     """s_i . y_j for i no newer than j, else 0."""
@@ -120,30 +123,30 @@ class _Memory(NamedTuple):
 
 
 class _Slots(NamedTuple):
-    """The lanes at work: an accepted position each, and what was evaluated there.
+    """The members at work: an accepted position each, and what was evaluated there.
 
     The slots come first, since products with the memory are slot by slot; in ``at`` they come last,
-    since an evaluation is vertex by vertex (energy.py).
+    since an evaluation is vertex by vertex (ell.py).
     """
 
-    p: Float[Array, "w 3 n"]
+    p: Float[Array, "w 3 vertices"]
     at: Sample
-    z: Float[Array, "w 3 n"]
+    z: Float[Array, "w 3 vertices"]
     """A^-1 gradient: the plain step, negated."""
     gain: Float[Array, "w"]
     """<gradient, z>: twice what a plain step is expected to gain."""
-    turn: Int[Array, "w"]
+    iteration: Int[Array, "w"]
     """Evaluations done."""
     history: Float[Array, "w history"]
     memory: _Memory
     stalled: Bool[Array, "w"]
 
 
-def _run_queue(evaluate, system, held, start, settings: Settings) -> Descent:
+def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
     count = start.shape[0]
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
     slots = min(count, most)
-    out = Descent(
+    out = Minimum(
         jnp.zeros_like(start),
         jnp.zeros((count, 3, *start.shape[1:]), start.dtype),
         jnp.zeros((count, settings.max_steps + 1), start.dtype),
@@ -154,34 +157,34 @@ def _run_queue(evaluate, system, held, start, settings: Settings) -> Descent:
         return out
     work = _empty(start[:slots], settings)
     work = _restart(work, jnp.ones(slots, bool), work.p)
-    lane = jnp.arange(slots, dtype=jnp.int32)
+    member = jnp.arange(slots, dtype=jnp.int32)
 
-    def turn_over(state):
-        """Iterate until a lane is done; put it away and take the next ones."""
-        tick, lane, following, work, out = state
-        own = jax.tree.map(lambda x: jnp.moveaxis(x.at[lane].get(mode="clip"), 0, -1), held)
+    def finish_some(state):
+        """Iterate until a member is done; put it away and take the next ones."""
+        tick, member, following, work, out = state
+        own = jax.tree.map(lambda x: jnp.moveaxis(x.at[member].get(mode="clip"), 0, -1), inputs)
         advance = partial(_advance, evaluate, system, own, settings)
-        idle = lane >= count
+        idle = member >= count
         tick, work = jax.lax.while_loop(
             lambda s: ~jnp.any(_done(s[1], settings) & ~idle), lambda s: advance(*s), (tick, work)
         )
         done = _done(work, settings) & ~idle
         ended = work.stalled | _converged(work, settings)
         transforms = jnp.moveaxis(work.at.transforms, -1, 0)
-        found = Descent(work.p, transforms, work.history, work.turn - 1, ended)
-        place = jnp.where(done, lane, count)
+        found = Minimum(work.p, transforms, work.history, work.iteration - 1, ended)
+        place = jnp.where(done, member, count)
         out = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), out, found)
-        lane = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, lane)
-        # A slot for which no lane is left stays at its solution, where a step costs the least.
-        work = _restart(work, done & (lane < count), start.at[lane].get(mode="clip"))
-        return tick, lane, following + jnp.sum(done, dtype=jnp.int32), work, out
+        member = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, member)
+        # A slot for which no member is left stays at its solution, where a step costs the least.
+        work = _restart(work, done & (member < count), start.at[member].get(mode="clip"))
+        return tick, member, following + jnp.sum(done, dtype=jnp.int32), work, out
 
-    begin = (jnp.zeros((), jnp.int32), lane, jnp.asarray(slots, jnp.int32), work, out)
-    return jax.lax.while_loop(lambda s: jnp.any(s[1] < count), turn_over, begin)[-1]
+    begin = (jnp.zeros((), jnp.int32), member, jnp.asarray(slots, jnp.int32), work, out)
+    return jax.lax.while_loop(lambda s: jnp.any(s[1] < count), finish_some, begin)[-1]
 
 
-def _empty(p: Float[Array, "w 3 n"], settings: Settings) -> _Slots:
-    w, m, dtype = p.shape[0], settings.memory, p.dtype
+def _empty(p: Float[Array, "w 3 vertices"], settings: Settings) -> _Slots:
+    w, m, dtype = p.shape[0], settings.history_length, p.dtype
     zeros = lambda *shape: jnp.zeros((w, *shape), dtype)  # noqa: E731
     shape, small = p.shape[1:], (m, m)
     at = Sample(*(jnp.zeros((*axes, w), dtype) for axes in ((3, *shape), shape, (), ())))
@@ -189,18 +192,18 @@ def _empty(p: Float[Array, "w 3 n"], settings: Settings) -> _Slots:
     memory = _Memory(
         zeros(m, *shape), zeros(m, *shape), filled, zeros(*small), zeros(*small), zeros(m), zeros(m)
     )
-    turn, history = jnp.zeros(w, jnp.int32), zeros(settings.max_steps + 1)
-    return _Slots(p, at, zeros(*shape), zeros(), turn, history, memory, jnp.zeros(w, bool))
+    iteration, history = jnp.zeros(w, jnp.int32), zeros(settings.max_steps + 1)
+    return _Slots(p, at, zeros(*shape), zeros(), iteration, history, memory, jnp.zeros(w, bool))
 
 
-def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 n"]) -> _Slots:
+def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 vertices"]) -> _Slots:
     """Put some slots before their first evaluation: a step of zero, from infinite energy."""
     wide = which[:, None, None]
     return work._replace(
         p=jnp.where(wide, p, work.p),
         z=jnp.where(wide, 0.0, work.z),
         at=work.at._replace(energy=jnp.where(which, jnp.inf, work.at.energy)),
-        turn=jnp.where(which, 0, work.turn),
+        iteration=jnp.where(which, 0, work.iteration),
         memory=work.memory._replace(filled=work.memory.filled & ~which[:, None]),
         stalled=work.stalled & ~which,
     )
@@ -211,25 +214,27 @@ def _converged(work: _Slots, settings: Settings) -> Bool[Array, "w"]:
 
 
 def _done(work: _Slots, settings: Settings) -> Bool[Array, "w"]:
-    running = (work.turn <= settings.max_steps) & ~work.stalled & ~_converged(work, settings)
-    return (work.turn > 0) & ~(running & jnp.isfinite(work.at.energy))
+    running = (work.iteration <= settings.max_steps) & ~work.stalled & ~_converged(work, settings)
+    return (work.iteration > 0) & ~(running & jnp.isfinite(work.at.energy))
 
 
-def _advance(evaluate, system, held, settings: Settings, tick, work: _Slots):
+def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
     step = _direction(work.memory, work.z, tick)
-    # The first turn evaluates the start: its step is zero, its old energy infinite. (So the local
-    # step is compiled once.) A lane that is done waits.
+    # The first iteration evaluates the start: its step is zero, its old energy infinite. (So the
+    # local step is compiled once.) A member that is done waits.
     step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
     p = work.p + step
-    new = _apart(tick >= 0, work.at, partial(evaluate, system), held, jnp.moveaxis(p, 0, -1))
+    new = without_fusion(
+        tick >= 0, work.at, partial(evaluate, system), inputs, jnp.moveaxis(p, 0, -1)
+    )
     right = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 0)
     g = right[:, 1]
     z = system.factor.solve(g)
     dz = z - work.z
-    # All inner products of a turn that are not with the memory, as one batched product.
+    # All inner products of an iteration that are not with the memory, as one batched product.
     left = jnp.stack([step, dz, z], axis=1)
     products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
-    first = work.turn == 0
+    first = work.iteration == 0
     good = (new.energy <= work.at.energy + work.at.rounding) | first
     # A refused step costs its evaluation and the memory; the plain step that follows cannot raise
     # the energy, so a second refusal in a row is rounding.
@@ -238,23 +243,14 @@ def _advance(evaluate, system, held, settings: Settings, tick, work: _Slots):
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
     at = jax.tree.map(keep, new, work.at)
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
-    history = work.history.at[slot, work.turn].set(at.energy, mode="drop")
+    history = work.history.at[slot, work.iteration].set(at.energy, mode="drop")
     wide = good[:, None, None]
     p, z = jnp.where(wide, p, work.p), jnp.where(wide, z, work.z)
     gain = keep(products[:, 2, 1], work.gain)
-    return tick + 1, _Slots(p, at, z, gain, work.turn + 1, history, memory, stalled)
+    return tick + 1, _Slots(p, at, z, gain, work.iteration + 1, history, memory, stalled)
 
 
-def _apart(always: Bool[Array, ""], otherwise, function, *arguments):
-    """Run a function as a computation of its own.
-
-    Else the compiler repeats the end of it, here the sum that makes the gradient, inside every
-    expression that reads it: 3 of the 7 ms of a turn of 16 bars.
-    """
-    return jax.lax.cond(always, function, lambda *_: otherwise, *arguments)
-
-
-def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 n"]:
+def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 vertices"]:
     """The two-loop recursion (Nocedal 1980) on the coefficients of s and z.
 
     From the newest step to the oldest and back: two triangular systems with the matrix s_i . y_j.
@@ -280,16 +276,15 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 n"]:
 def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
     """Put new steps into the oldest slot, if the curvature along them is positive.
 
-    A lane whose step was not good forgets all.
+    A slot whose step was not good forgets all.
     """
     m = memory.filled.shape[1]
     age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
     sy, yzy = products[:, 0, 0], products[:, 1, 0]
     sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
     zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
-    # (NaN fails the comparison; so nothing that is not finite ever comes in.) That it reads sg and
-    # zg tells the compiler that the old arrays are done with, so it writes into them, not a copy.
-    kept = new & (sy > 1e-10 * yzy) & jnp.isfinite(yzy + jnp.sum(sg + zg, axis=1))
+    # NaN fails both comparisons, so nothing that is not finite ever comes in.
+    kept = after_reads(new & (sy > 1e-10 * yzy), yzy + jnp.sum(sg + zg, axis=1))
     column, square = sg - memory.sg, zg - memory.zg
 
     def later(matrix, row, column, corner):

@@ -95,15 +95,16 @@ def _svd_rotation(rotation: Grid, c: Grid) -> Grid:
 
 
 @jax.custom_jvp
-def attach_rotation(rotation: Matrices, c: Matrices) -> Matrices:
+def rotation_with_derivative(rotation: Matrices, c: Matrices) -> Matrices:
     del c
     return rotation
 
 
-@attach_rotation.defjvp
-def _attach_rotation_jvp(primals, tangents):
+@rotation_with_derivative.defjvp
+def _rotation_jvp(primals, tangents):
     """``dR = R [w]x`` with ``(tr(M) I - M) w = axial(N - N^T)``, M = C R, N = R^T dC^T."""
     rotation, c = primals
+    rotation = rotation_with_derivative(rotation, c)  # so that this rule has derivatives too
     dc = tangents[1]
     r, rt = as_grid(rotation), transpose(as_grid(rotation))
     m = product(as_grid(c), r)

@@ -1,35 +1,55 @@
 """Cells: which edges move together with a vertex (thesis Sec. 2.3)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.laplacian import cotangent_weights
-from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
+from jaxdeform._mesh.mesh import Mesh, content_digest
+from jaxdeform.errors import ArrayLike, InputError
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
     """One cell per vertex: the edges whose deformation its transformation must explain.
 
-    Made by :func:`rings` and :func:`spokes`.
+    Made by :func:`rings` and :func:`spokes`. Cells are a value, as the mesh is.
     """
 
-    edges: Int[np.ndarray, "edges 2"]
-    """Undirected edges (i < j), each once, as in ``mesh.edges``."""
+    mesh: Mesh
+    """The rest shape that the cells belong to."""
     weights: Float[np.ndarray, "edges"]
-    """One weight per edge; cotangents unless the caller gave others."""
+    """One weight per row of ``mesh.edges``; cotangents unless the caller gave others."""
     membership: sp.csr_matrix
     """(vertices, edges), 1 where the edge belongs to the vertex's cell."""
 
     @property
+    def edges(self) -> Int[np.ndarray, "edges 2"]:
+        """Undirected edges (i < j) of the mesh, each once."""
+        return self.mesh.edges
+
+    @property
     def n_vertices(self) -> int:
         """Number of cells, which is the number of vertices."""
-        return len(self.membership.indptr) - 1
+        return self.mesh.n_vertices
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Fingerprint of the content: equal for equal cells, in any process."""
+        member = self.membership
+        mesh = np.frombuffer(self.mesh.digest, np.uint8)
+        return content_digest(mesh, self.weights, member.indptr, member.indices, member.data)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other cells have the same mesh, weights and members."""
+        return self is other or (isinstance(other, Cells) and self.digest == other.digest)
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash(self.digest)
 
     @property
     def overlap(self) -> Int[np.ndarray, "edges"]:
@@ -37,7 +57,7 @@ class Cells:
         return np.bincount(self.membership.indices, minlength=len(self.edges))
 
     @property
-    def vertices(self) -> sp.csr_matrix:
+    def reach(self) -> sp.csr_matrix:
         """(cells, vertices), nonzero where an edge of the cell ends, and at its centre."""
         count, n = len(self.edges), self.n_vertices
         rows = np.repeat(np.arange(count), 2)
@@ -60,10 +80,10 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     **Arguments**
 
     - mesh: the rest shape.
-    - r: an integer >= 1, or one per vertex, (n,).
-    - weights: one finite weight per row of ``mesh.edges``, used as they are. If left out: cotangent
-      weights, of which the negative ones (obtuse angles) are kept, except in cells whose moments
-      ``B_k = sum w e e^T`` they make indefinite. There they are set to 0, since such a cell would
+    - r: an integer >= 1, or one per vertex, (vertices,).
+    - weights: one finite weight per row of ``mesh.edges``, used as they are. The default is
+      cotangent weights. Their negative ones (obtuse angles) are kept, except in cells whose moments
+      ``B_k = sum w e e^T`` they make indefinite. There they are set to 0, because such a cell would
       gain energy from stretching. Few meshes have such cells.
 
     **Raises** InputError: r below 1, not an integer, or of the wrong length; weights likewise.
@@ -108,7 +128,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     chosen = _weights(mesh, weights)
     if weights is None:
         chosen = _bounded(mesh, ends, chosen)
-    return Cells(mesh.edges, chosen, ends)
+    return Cells(mesh, chosen, ends)
 
 
 def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
@@ -123,29 +143,30 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
         >>> jd.spokes(jd.shapes.bar())
         Cells(722 cells, 2160 edges, 6.0 edges a cell)
     """
-    return Cells(mesh.edges, _weights(mesh, weights), _incidence(mesh))
+    return Cells(mesh, _weights(mesh, weights), _incidence(mesh))
 
 
-def moments(
-    edges: Int[np.ndarray, "edges 2"],
-    weights: Float[np.ndarray, "edges"],
-    membership: sp.csr_matrix,
-    vertices: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """Return ``b_k`` (ascending), proper ``Q_k`` of ``B_k = sum_e w_e e e^T = Q diag(b) Q^T``."""
-    edge = vertices[edges[:, 0]] - vertices[edges[:, 1]]
-    outer = weights[:, None, None] * edge[:, :, None] * edge[:, None, :]
-    b = (membership.astype(np.float64) @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
-    values, frames = np.linalg.eigh(b)
-    # Proper frames: a reflection would turn the proper rotation of a cell into an improper one.
-    frames[:, :, 0] *= np.sign(np.linalg.det(frames))[:, None]
-    return values, frames
+def principal_moments(
+    cells: Cells,
+) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3 3"]]:
+    """Return the moments b (ascending) and the axes Q of ``B_k = sum_e w_e e e^T = Q diag(b) Q^T``.
+
+    The columns of ``Q_k`` are the principal axes of cell k, a proper rotation.
+    """
+    i, j = cells.edges.T
+    edge = cells.mesh.vertices[i] - cells.mesh.vertices[j]
+    outer = cells.weights[:, None, None] * edge[:, :, None] * edge[:, None, :]
+    moments = (cells.membership.astype(np.float64) @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
+    values, axes = np.linalg.eigh(moments)
+    # A reflection would turn the proper rotation of a cell into an improper one.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return values, axes
 
 
-def indefinite_cells(cells: Cells, vertices: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "bad"]:
+def indefinite_cells(cells: Cells) -> Int[np.ndarray, "bad"]:
     """Return the cells with a clearly negative moment."""
-    b, _ = moments(cells.edges, cells.weights, cells.membership, vertices)
-    return np.flatnonzero(b[:, 0] < -1e-9 * np.abs(b).max(axis=1))
+    moments, _ = principal_moments(cells)
+    return np.flatnonzero(moments[:, 0] < -1e-9 * np.abs(moments).max(axis=1))
 
 
 def _bounded(
@@ -154,7 +175,7 @@ def _bounded(
     """Set the negative weights in indefinite cells to 0; raising a weight harms no other cell."""
     if (weights >= 0).all():
         return weights
-    bad = indefinite_cells(Cells(mesh.edges, weights, membership), mesh.vertices)
+    bad = indefinite_cells(Cells(mesh, weights, membership))
     touched = np.unique(membership[bad].indices)
     out = weights.copy()
     out[touched] = np.maximum(out[touched], 0.0)

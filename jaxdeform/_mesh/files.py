@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.formats import FORMATS, ply_columns, to_ply
 from jaxdeform._mesh.mesh import Mesh, merge_equal_points
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
@@ -94,7 +93,7 @@ def save_mesh(
         content = to_ply(points, mesh.faces, rigidity)
     else:
         content = FORMATS[suffix].to_bytes(points, mesh.faces)
-    write_beside(path, lambda name: Path(name).write_bytes(content))
+    write_atomically(path, lambda name: Path(name).write_bytes(content))
 
 
 def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "n"]:
@@ -159,7 +158,7 @@ def _read_bytes(path: Path) -> bytes:
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-def write_beside(path: Path, write: Callable[[str], object]) -> None:
+def write_atomically(path: Path, write: Callable[[str], object]) -> None:
     """Call ``write(name)`` on a temporary file beside path, then move it into place.
 
     **Raises** InputError where the folder cannot be written; the file that was there is kept.

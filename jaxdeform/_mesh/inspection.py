@@ -4,25 +4,24 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Int
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
     Mesh,
     checked_arrays,
+    connected_components,
     degenerate_faces,
     merge_equal_points,
     unique_edges,
 )
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 # A broken mesh cannot be made a Mesh, so what mends and inspects takes it in any of three forms.
 MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike
 
 
-def _arrays(mesh: MeshLike) -> tuple[ArrayLike, ArrayLike]:
+def _arrays(mesh: object) -> tuple[ArrayLike, ArrayLike]:
     if isinstance(mesh, Mesh):
         return mesh.vertices, mesh.faces
     if isinstance(mesh, str | os.PathLike):
@@ -131,8 +130,7 @@ def _inspect_structure(points, faces, counts, report) -> None:
     edges = unique_edges(faces)
     counts["edges"] = len(edges)
     n = len(points)
-    graph = sp.coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(n, n))
-    _, label = sp.csgraph.connected_components(graph, directed=False)
+    label = connected_components(edges, n)
     used = np.unique(faces)
     components = len(np.unique(label[used]))
     counts["components"] = components
@@ -177,8 +175,7 @@ def _fans(faces: np.ndarray, edge: np.ndarray) -> Int[np.ndarray, "n"]:
     order = np.argsort(key, kind="stable")
     same = key[order][1:] == key[order][:-1]
     links = (node[order][:-1][same], node[order][1:][same])
-    graph = sp.coo_matrix((np.ones(len(links[0])), links), shape=(faces.size,) * 2)
-    _, label = sp.csgraph.connected_components(graph, directed=False)
+    label = connected_components(np.stack(links, axis=1), faces.size)
     _, first = np.unique(label, return_index=True)
     return np.bincount(faces.ravel()[first])
 

@@ -1,4 +1,16 @@
-"""Cotangent weights and the weighted graph Laplacian (thesis Sec. 2.4)."""
+"""Cotangent weights and the weighted graph Laplacian (thesis Sec. 2.4).
+
+Negative weights. An edge whose opposite angles sum to more than 180 degrees has a negative
+cotangent weight. The policy, in one place:
+
+- The weights are kept as they are, so that A is the exact Dirichlet energy and the engine agrees
+  with other ARAP programs.
+- ``rings`` sets them to 0 in the few cells whose moments they make indefinite (cells.py).
+- Where A is indefinite all the same, ``precompute`` lifts all weights by :func:`lifted_weights`,
+  with a warning. The smoothness prior of estimation, which would reward differences across an edge
+  of negative weight, uses lifted weights always.
+- :func:`normalised_laplacian` keeps its divisors away from 0.
+"""
 
 import igl
 import numpy as np
@@ -15,11 +27,12 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
     edge on the border has one such angle, an edge with three faces has three. Weights are pure
     numbers: they do not change when the mesh is scaled.
 
-    A weight is negative where the angles sum to more than 180 degrees. They are kept: for cells
-    of equal overlap the stiffness matrix is then still the exact Dirichlet energy, which is never
-    negative, and the engine agrees with other ARAP programs. Where mixed neighbourhoods make the
-    matrix indefinite after all, :func:`jaxdeform.precompute` lifts the negative weights to a small
-    positive one and says so. To have none from the start, pass ``np.maximum(w, 1e-6)``.
+    A weight is negative where the angles sum to more than 180 degrees. Such weights are kept: for
+    cells of equal overlap the stiffness matrix is then still the exact Dirichlet energy, which is
+    never negative, and the engine agrees with other ARAP programs. Where mixed neighbourhoods make
+    the matrix indefinite all the same, :func:`precompute` lifts the negative weights to a small
+    positive one and warns. To have none from the start, pass ``np.maximum(w, 1e-6)`` to
+    :func:`rings` or :func:`spokes`.
 
     **Arguments**: mesh. **Returns**: (edges,) floats in the order of ``mesh.edges``.
 
@@ -36,6 +49,11 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
     return np.asarray(matrix[i, j]).ravel()
 
 
+def lifted_weights(weights: Float[np.ndarray, "edges"]) -> Float[np.ndarray, "edges"]:
+    """Return the weights, none of them below 1e-3 of their mean size."""
+    return np.maximum(weights, 1e-3 * np.abs(weights).mean())
+
+
 def difference_matrix(edges: Int[np.ndarray, "edges 2"], n_vertices: int) -> sp.csr_matrix:
     """Return D (edges, vertices) with ``(D p)_e = p_i - p_j`` for the edge e = (i, j)."""
     count = len(edges)
@@ -50,3 +68,16 @@ def graph_laplacian(
     """Return ``D^T diag(w) D``: positive semidefinite wherever no weight is negative."""
     difference = difference_matrix(edges, n_vertices)
     return (difference.T @ sp.diags(weights) @ difference).tocsr()
+
+
+def normalised_laplacian(
+    edges: Int[np.ndarray, "edges 2"], weights: Float[np.ndarray, "edges"], n_vertices: int
+) -> sp.csr_matrix:
+    """Return L of Eq. 3.1: each row of the Laplacian divided by the weights at its vertex.
+
+    Where negative weights bring that sum near 0, 1e-2 of the sum of absolute weights is taken.
+    """
+    laplacian = graph_laplacian(edges, weights, n_vertices)
+    size = sum(np.bincount(end, np.abs(weights), n_vertices) for end in edges.T)
+    total = np.maximum(laplacian.diagonal(), 1e-2 * size)
+    return sp.csr_matrix(sp.diags(1.0 / np.where(total > 0, total, 1.0)) @ laplacian)

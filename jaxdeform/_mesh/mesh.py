@@ -1,28 +1,34 @@
 """Triangle meshes: checked once, then frozen (thesis chapter 2)."""
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
+import scipy.sparse as sp
+from jaxtyping import Bool, Float, Int
 
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
-# A triangle lower than this part of its longest edge has no area that float64 could tell from
-# rounding; its cotangents would be noise. Thin but real ones (0.4 degrees) are 1e10 above it.
+# A triangle lower than this fraction of its longest edge has no area that float64 could tell from
+# rounding: its cotangents would be noise. Thin but real triangles (0.4 degrees) are 1e10 above it.
 _FLAT = 1e-13
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
-    """A triangle mesh, checked once, when it is made.
+    """A triangle mesh: checked once, when it is made, and frozen.
 
     Open borders, several components, unreferenced vertices, non-manifold edges and vertices, and
-    faces turned inwards are all allowed; :func:`inspect` reports them.
+    faces that point inwards are all allowed; :func:`inspect` reports them.
+
+    A mesh is a value. Two meshes with the same numbers are equal and hash alike, also after pickle
+    or in another process. Its arrays are read-only: copy one before you change it.
+
+    **Arguments**: vertices (vertices, 3), any unit of length; faces (faces, 3), vertex indices.
 
     **Raises** InputError: arrays of the wrong shape or empty; a vertex that is not finite; a face
-    index out of range; a face that repeats a vertex or has no area. :func:`repair` mends the last.
+    index out of range; a face that repeats a vertex or has no area (:func:`repair` drops those).
 
     Example:
         >>> import jaxdeform as jd
@@ -30,9 +36,9 @@ class Mesh:
         Mesh(3 vertices, 1 faces)
     """
 
-    vertices: Float[np.ndarray, "n 3"]
+    vertices: Float[np.ndarray, "vertices 3"]
     """Positions, any unit of length."""
-    faces: Int[np.ndarray, "m 3"]
+    faces: Int[np.ndarray, "faces 3"]
     """Vertex indices, counter-clockwise seen from outside."""
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
@@ -61,6 +67,40 @@ class Mesh:
     def edges(self) -> Int[np.ndarray, "edges 2"]:
         """Undirected edges (i < j), each once, sorted."""
         return unique_edges(self.faces)
+
+    @cached_property
+    def referenced(self) -> Bool[np.ndarray, "vertices"]:
+        """True for the vertices that belong to a face."""
+        mask = np.zeros(self.n_vertices, bool)
+        mask[self.faces.ravel()] = True
+        return mask
+
+    @cached_property
+    def components(self) -> Int[np.ndarray, "vertices"]:
+        """Connected component of each vertex, numbered from 0."""
+        return connected_components(self.edges, self.n_vertices)
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the bounding box of the vertices that belong to a face."""
+        return float(np.linalg.norm(np.ptp(self.vertices[self.referenced], axis=0)))
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Fingerprint of the content: equal for equal meshes, in any process."""
+        return content_digest(self.vertices, self.faces)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other mesh has the same numbers."""
+        return self is other or (isinstance(other, Mesh) and self.digest == other.digest)
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash(self.digest)
+
+    def __reduce__(self):
+        """Pickle the two arrays; they are checked and frozen again on loading."""
+        return Mesh, (self.vertices, self.faces)
 
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
@@ -120,7 +160,25 @@ def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
     return np.stack([code // n, code % n], axis=1)
 
 
-def merge_equal_points(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+def connected_components(
+    edges: Int[np.ndarray, "edges 2"], n_vertices: int
+) -> Int[np.ndarray, "vertices"]:
+    """Return the connected component of each vertex, numbered from 0."""
+    links = (np.ones(len(edges), np.int8), tuple(edges.T))
+    graph = sp.coo_matrix(links, shape=(n_vertices, n_vertices))
+    return sp.csgraph.connected_components(graph, directed=False)[1]
+
+
+def content_digest(*arrays: np.ndarray) -> bytes:
+    """Return a 128-bit fingerprint of the shapes, types and numbers of some arrays."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(f"{array.shape} {array.dtype.str}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()
+
+
+def merge_equal_points(points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct points in order of appearance, and for each old point its new index."""
     points = points + 0.0  # makes -0.0 equal to 0.0
     _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)

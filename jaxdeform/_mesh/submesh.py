@@ -4,16 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
+from jaxdeform.errors import ArrayLike, InputError
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """A piece of a mesh around its free vertices; made by :func:`cut`."""
+class Submesh:
+    """A piece of a mesh around its free vertices; made by :func:`submesh`."""
 
     mesh: Mesh
     """The piece as a mesh of its own."""
@@ -26,7 +25,7 @@ class Part:
     whole: Mesh
     """The mesh that it was cut from."""
 
-    def restore(
+    def reinsert(
         self, vertices: ArrayLike, base: ArrayLike | None = None
     ) -> Float[np.ndarray, "n 3"]:
         """Return the whole mesh's positions with the piece put back.
@@ -47,7 +46,7 @@ class Part:
         return out
 
 
-def cut(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Part:
+def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     """Cut out the cells in which something can move, and no more.
 
     A cell of fixed vertices only has a fixed transformation, so it may be left out: the piece
@@ -64,18 +63,18 @@ def cut(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Part:
     Example:
         >>> import jaxdeform as jd
         >>> mesh = jd.shapes.bar()
-        >>> part = jd.cut(mesh, mesh.vertices[:, 1] > 120)
+        >>> part = jd.submesh(mesh, mesh.vertices[:, 1] > 120)
         >>> problem = jd.precompute(part.mesh, part.handles, cells=part.cells)
         >>> out = jd.deform(problem, part.mesh.vertices[part.handles], 1.0)
-        >>> part.restore(out.vertices).shape
+        >>> part.reinsert(out.vertices).shape
         (722, 3)
     """
     cells = rings(mesh, 1) if cells is None else cells
-    if cells.n_vertices != mesh.n_vertices:
+    if cells.mesh != mesh:
         raise InputError("cells are of another mesh: call rings(mesh, r) on this one")
     is_free = _mask(free, mesh.n_vertices)
     # The vertices of each cell, its centre included.
-    reach = cells.vertices
+    reach = cells.reach
     moving = np.asarray((reach @ is_free.astype(np.int32)) > 0).ravel()
     kept = np.unique(reach[moving].indices)
     index = np.union1d(kept, np.flatnonzero(is_free))
@@ -97,8 +96,8 @@ def cut(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Part:
         np.int8
     )
     membership.eliminate_zeros()
-    part_cells = Cells(piece.edges, cells.weights[edge], membership[index][:, edge].tocsr())
-    return Part(piece, part_cells, np.flatnonzero(~is_free[index]), index, mesh)
+    part_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
+    return Submesh(piece, part_cells, np.flatnonzero(~is_free[index]), index, mesh)
 
 
 def _mask(free: ArrayLike, n: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import EXACT, REAL, real_mesh
+from helpers import EXACT, REAL, real_mesh
 from scipy.linalg import expm
 
 import jaxdeform as jd

@@ -36,7 +36,7 @@ def test_cell_vertices_and_overlap():
     cells = jd.rings(mesh, np.array([1, 2, 1, 1, 1, 1, 1, 2]))
     member = cells.membership.toarray()
     np.testing.assert_array_equal(cells.overlap, member.sum(axis=0))
-    inside = cells.vertices.toarray() > 0
+    inside = cells.reach.toarray() > 0
     for k in range(mesh.n_vertices):
         want = set(mesh.edges[member[k] == 1].ravel()) | {k}
         assert set(np.flatnonzero(inside[k])) == want
@@ -46,7 +46,7 @@ def test_an_unreferenced_vertex_has_an_empty_cell_with_itself_as_vertex():
     mesh = jd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]], [[0, 1, 2]])
     for cells in (jd.rings(mesh, 3), jd.spokes(mesh)):
         assert cells.membership[3].nnz == 0
-        assert cells.vertices[3].indices.tolist() == [3]
+        assert cells.reach[3].indices.tolist() == [3]
 
 
 def test_given_weights_are_kept():

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import FD, ends
+from helpers import FD, bumpy_sheet, ends
 from scipy.spatial.transform import Rotation
-from sheet import bumpy_sheet
 
 import jaxdeform as jd
 

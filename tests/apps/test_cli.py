@@ -1,4 +1,4 @@
-"""The command line through its entry point: results, mistakes, Ctrl-C."""
+"""The command line."""
 
 import json
 import os
@@ -244,8 +244,3 @@ def test_ctrl_c_leaves_old_files_whole(files):
     assert err == "jaxdeform: interrupted; files that were there are whole\n"
     assert (files / "out.ply").read_text() == "old"
     assert sorted(os.listdir(files)) == before
-
-
-def test_pictures_of_a_bad_name(bar, tmp_path):
-    with pytest.raises(jd.InputError, match=r"use a \.png name"):
-        jd.picture(tmp_path / "bar.jpg", bar, [bar.vertices])

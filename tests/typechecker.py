@@ -1,0 +1,25 @@
+"""beartype for every function, but for the arguments of public ones, which check them themselves."""
+
+import ast
+from pathlib import Path
+
+from beartype import beartype
+
+INIT = Path(__file__).parents[1] / "jaxdeform" / "__init__.py"
+PUBLIC = next(
+    set(ast.literal_eval(node.value))
+    for node in ast.parse(INIT.read_text()).body
+    if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
+)
+
+
+def check(function):
+    """Return the function with its annotations checked at every call.
+
+    Misuse of a public function must reach the function's own checks, which say what is wrong. So of
+    those only what they return is checked.
+    """
+    if getattr(function, "__qualname__", "") in PUBLIC:
+        returns = {k: v for k, v in function.__annotations__.items() if k == "return"}
+        function.__annotations__ = returns
+    return beartype(function)
