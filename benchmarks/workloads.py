@@ -7,7 +7,6 @@ import igl
 import numpy as np
 
 import jaxdeform as jd
-from benchmarks.internals import LocalStep
 
 MATERIAL = 0.2
 """The scale-free material constant of suites that name no rigidity."""
@@ -32,7 +31,7 @@ class Workload:
         """The start that all methods get: Laplacian editing."""
         return np.array(jd.laplacian_editing(self.mesh, self.handles, self.targets))
 
-    def reduced_energy(self, problem: jd.Problem, vertices, rigidity, local: LocalStep) -> float:
+    def reduced_energy(self, problem: jd.Problem, vertices, rigidity, local: jd.LocalStep) -> float:
         """Return min over T of Eq. 4.4 at given positions: one functional for every method."""
         once = jd.Alternating(1)
         out = jd.deform(problem, self.targets, rigidity, local=local, start=vertices, solver=once)

@@ -21,7 +21,15 @@ from jaxdeform._baselines.skinning_weights import (
 )
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
+from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.local_step import (
+    LBFGS,
+    AffineFit,
+    GradientDescent,
+    LocalStep,
+    Newton,
+    RotationFit,
+)
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
@@ -51,6 +59,7 @@ from jaxdeform.shapes import bend, rotate, translate, twist
 
 __all__ = [
     "LBFGS",
+    "Adjoint",
     "AffineFit",
     "Alternating",
     "Cells",
@@ -62,6 +71,7 @@ __all__ = [
     "InputError",
     "Inspection",
     "LaplacianEditor",
+    "LocalStep",
     "Mesh",
     "Newton",
     "Problem",
@@ -71,6 +81,7 @@ __all__ = [
     "RotationFit",
     "Skeleton",
     "Solution",
+    "Solver",
     "Submesh",
     "ThesisEstimate",
     "Unrolled",

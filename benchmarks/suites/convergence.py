@@ -8,7 +8,6 @@ import numpy as np
 import jaxdeform as jd
 from benchmarks import workloads
 from benchmarks.harness import interleaved
-from benchmarks.internals import LocalStep
 from benchmarks.metrics import Curve, Findings, Metric
 from benchmarks.workloads import Workload
 
@@ -21,7 +20,7 @@ class Case(NamedTuple):
     name: str
     problem: jd.Problem
     rigidity: float
-    local: LocalStep
+    local: jd.LocalStep
     target: float
 
 
@@ -112,7 +111,7 @@ def _libigl_descent(load: Workload, problem: jd.Problem) -> tuple[list[int], lis
     return steps, energies
 
 
-def _energies(load: Workload, problem: jd.Problem, rigidity: float, local: LocalStep):
+def _energies(load: Workload, problem: jd.Problem, rigidity: float, local: jd.LocalStep):
     """Return the energy at the start and after each iteration, down to the minimum."""
     solver = jd.QuasiNewton(tolerance=1e-13, max_steps=3000)
     out = jd.deform(problem, load.targets, rigidity, local=local, solver=solver, start=load.start)
