@@ -1,6 +1,5 @@
 """jaxdeform: differentiable mesh deformation in JAX, every part with its own rigidity."""
 
-from jaxdeform import shapes
 from jaxdeform._baselines.cages import mean_value_coordinates
 from jaxdeform._baselines.laplacian_editing import (
     LaplacianEditor,
@@ -35,6 +34,8 @@ from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
 from jaxdeform._handles.files import HandleFile, load_handles
 from jaxdeform._handles.rigid import rigid_targets
+from jaxdeform._handles.targets import bend, rotate, translate, twist
+from jaxdeform._mesh import shapes
 from jaxdeform._mesh.cells import Cells, rings, spokes
 from jaxdeform._mesh.files import load_mesh, load_rigidity, save_mesh
 from jaxdeform._mesh.inspection import Inspection, inspect, repair
@@ -55,7 +56,6 @@ from jaxdeform.estimation import (
 )
 from jaxdeform.plotting import render
 from jaxdeform.result import Result
-from jaxdeform.shapes import bend, rotate, translate, twist
 
 __all__ = [
     "LBFGS",
