@@ -22,7 +22,7 @@ from jaxdeform.errors import InputError
 
 Points = Float[np.ndarray, "points 3"]
 Faces = Int[np.ndarray, "faces 3"]
-Path = tuple[Sequence[Sequence[float]], Sequence[float]]
+Path = tuple[Sequence[Sequence[float | int]], Sequence[float | int]]
 
 # A grid cell's corners, in the order in which igl.marching_cubes reads them.
 _CORNERS = np.array(
