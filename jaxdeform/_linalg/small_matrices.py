@@ -1,13 +1,13 @@
-"""3x3 and 9x9 algebra by components, over all cells at once."""
+"""Algebra of 3x3 and 9x9 matrices by components, over all cells at once."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Matrices = Float[Array, "3 3 n"]
-Vectors = Float[Array, "3 n"]
-Scalars = Float[Array, "n"]
-# One component of all cells at a time: plain Python lists of (n,) arrays, so that every product
-# below is one contiguous, vectorised pass, and small matrices cost no transposition.
+Matrices = Float[Array, "3 3 cells"]
+Vectors = Float[Array, "3 cells"]
+Scalars = Float[Array, "cells"]
+# A grid is a nested Python list of arrays (cells,), one per component. Every product below is then
+# one contiguous, vectorised pass, and transposing a matrix costs nothing.
 Grid = list[list[Array]]
 
 
@@ -56,9 +56,9 @@ def cross(u: list[Array], v: list[Array]) -> list[Array]:
 
 
 def ldl_solve(matrix: list[list[Array]], right: list[Array], floor: Array) -> list[Array]:
-    """Solve the symmetric 9x9 systems by LDL^T, unrolled into scalars: 13 ms for 51,200 cells.
+    """Solve symmetric 9x9 systems by LDL^T, unrolled into components: 13 ms for 51,200 cells.
 
-    A pivot below ``floor`` (a direction with no stiffness) is replaced by it.
+    A pivot below ``floor`` (a direction without stiffness) is replaced by ``floor``.
     """
     size = len(right)
     lower: list[list[Array]] = [[matrix[0][0]] * size for _ in range(size)]
