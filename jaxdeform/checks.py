@@ -1,4 +1,4 @@
-"""Arguments: read as arrays and checked, or refused by an InputError that names them."""
+"""Read arguments as arrays and check them, or raise an InputError that names them."""
 
 from typing import NamedTuple
 
@@ -12,24 +12,24 @@ from jaxdeform.errors import ArrayLike, InputError
 
 
 def is_concrete(x) -> bool:
-    """Return whether an array's values can be read now (they cannot while JAX traces)."""
+    """Return whether the values of an array can be read now; while JAX traces they cannot."""
     return not isinstance(x, Tracer)
 
 
 def as_array(value, dtype: np.dtype, name: str) -> Array:
-    """Return value as a JAX array, or raise InputError naming the argument."""
+    """Return the value as a JAX array, or raise InputError naming the argument."""
     return jnp.asarray(read_array(value, dtype, name))
 
 
 def read_array(value, dtype: np.dtype, name: str) -> Array | np.ndarray:
-    """Like :func:`as_array`, but leave on the host what is there.
+    """Like :func:`as_array`, but validate without moving NumPy arrays to the device.
 
-    A compiled function takes an array of NumPy's as it is, 0.1 ms sooner than one that JAX is still
+    A compiled function takes a NumPy array directly, 0.1 ms sooner than one that JAX is still
     copying.
     """
     try:
         if isinstance(value, np.ndarray | float | int) and np.asarray(value).dtype.kind in "iuf":
-            with np.errstate(over="ignore"):  # what does not fit is infinite, and found to be
+            with np.errstate(over="ignore"):  # overflow gives infinity, refused later
                 return np.asarray(value, dtype)
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError) as error:
@@ -39,51 +39,51 @@ def read_array(value, dtype: np.dtype, name: str) -> Array | np.ndarray:
 
 
 def check_positions(name: str, value, shape: tuple, dtype: np.dtype, unit: str = "vertex") -> Array:
-    """Return a JAX array of this shape, finite where its values are known, or raise InputError."""
+    """Return a JAX array of this shape, or raise InputError; finite, if its values are known."""
     return jnp.asarray(read_positions(name, value, shape, dtype, unit))
 
 
 def read_positions(
     name: str, value, shape: tuple, dtype: np.dtype, unit: str = "vertex"
 ) -> Array | np.ndarray:
-    """Like :func:`check_positions`, but leave on the host what is there."""
+    """Like :func:`check_positions`, but without moving NumPy arrays to the device."""
     array = read_array(value, dtype, name)
     if array.shape != shape:
         raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
     if is_concrete(array):
         bad = np.flatnonzero(~np.isfinite(np.asarray(array)).reshape(shape[0], -1).all(axis=1))
         if bad.size:
-            raise InputError(f"{name} of {unit} {bad[0]} are not finite: give real positions")
+            raise InputError(f"{name} of {unit} {bad[0]} are not finite: give finite numbers")
     return array
 
 
-def check_handles(handles: ArrayLike, n: int) -> Int[np.ndarray, "h"]:
-    """Return handle indices as an array, or raise InputError naming what is wrong."""
+def check_handles(handles: ArrayLike, n: int) -> Int[np.ndarray, "handles"]:
+    """Return the handle indices as an array, or raise InputError naming what is wrong."""
     given = np.asarray(handles)
     if given.ndim != 1:
         raise InputError(f"handles have shape {given.shape}: give one list of vertex indices")
     if given.size == 0:
-        raise InputError("no handles: without any the mesh may lie anywhere; give at least one")
+        raise InputError("no handles: without one the mesh could lie anywhere; give at least one")
     if given.dtype.kind not in "iu":
-        hint = ": use np.flatnonzero(mask)" if given.dtype == bool else ""
+        hint = ": use np.flatnonzero(mask)" if given.dtype == bool else ": give vertex indices"
         raise InputError(f"handles must be integers, got {given.dtype}{hint}")
     outside = np.flatnonzero((given < 0) | (given >= n))
     if outside.size:
         raise InputError(
-            f"handle {given[outside[0]]} (position {outside[0]}) is out of range: the mesh has "
-            f"vertices 0 to {n - 1}"
+            f"handle {given[outside[0]]} (position {outside[0]}) is out of range: vertices are 0 "
+            f"to {n - 1}"
         )
     unique, count = np.unique(given, return_counts=True)
     if (count > 1).any():
         raise InputError(
-            f"vertex {unique[count > 1][0]} is a handle {count.max()} times: list it "
-            "once, since it can have one target only"
+            f"vertex {unique[count > 1][0]} is a handle {count.max()} times: list it once, because "
+            "it can have only one target"
         )
     return given.astype(np.int64)
 
 
 def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
-    """Return one weight per handle, infinite for a hard one, or raise InputError."""
+    """Return one weight per handle, infinite for a hard handle, or raise InputError."""
     given = np.asarray(weights, np.float64)
     if given.ndim and given.shape != index.shape:
         raise InputError(
@@ -94,14 +94,14 @@ def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     bad = np.flatnonzero(~(given >= 0))
     if bad.size:
         raise InputError(
-            f"the weight of handle {index[bad[0]]} is {given[bad[0]]}: give 0 or more, np.inf to "
-            "fix it"
+            f"the weight of handle {index[bad[0]]} is {given[bad[0]]}: give 0 or more, or np.inf "
+            "to fix it"
         )
     return given
 
 
 def check_components(mesh: Mesh, anchored: Int[np.ndarray, "anchored"]) -> None:
-    """Raise InputError where a connected component of the mesh has no handle."""
+    """Raise InputError if a connected component of the mesh has no handle."""
     label = mesh.components
     loose = np.flatnonzero(mesh.referenced & ~np.isin(label, label[anchored]))
     if loose.size:
@@ -114,18 +114,18 @@ def check_components(mesh: Mesh, anchored: Int[np.ndarray, "anchored"]) -> None:
 
 
 class HandleSplit(NamedTuple):
-    """The vertices of a mesh by what holds them."""
+    """The vertices of a mesh, split into hard handles, soft handles and free vertices."""
 
     index: Int[np.ndarray, "handles"]
     """The handles, in the order given."""
     free: Bool[np.ndarray, "vertices"]
-    """True where a vertex moves: neither a hard handle nor without a face."""
+    """True for each vertex that is solved for: it has a face and is not a hard handle."""
     soft: Float[np.ndarray, "vertices"]
-    """Weight of each soft handle, 0 elsewhere."""
+    """The weight of each soft handle; 0 elsewhere."""
 
 
 def split_handles(mesh: Mesh, handles: ArrayLike, handle_weights: ArrayLike) -> HandleSplit:
-    """Split the vertices into hard handles, soft handles and free ones, or raise InputError."""
+    """Split the vertices into hard handles, soft handles and free vertices, or raise InputError."""
     index = check_handles(handles, mesh.n_vertices)
     weights = check_handle_weights(handle_weights, index)
     check_components(mesh, index[weights > 0])
@@ -153,11 +153,11 @@ def check_tolerance(name: str, value: float) -> float:
 
 
 def check_targets(targets: ArrayLike, count: int, dtype: np.dtype) -> Array | np.ndarray:
-    """Return targets as an array (h, 3), or raise InputError naming what is wrong."""
+    """Return the targets as an array (handles, 3), or raise InputError naming what is wrong."""
     return read_positions("targets", targets, (count, 3), dtype, unit="handle")
 
 
-def check_groups(group: ArrayLike, count: int) -> Int[np.ndarray, "h"]:
+def check_groups(group: ArrayLike, count: int) -> Int[np.ndarray, "handles"]:
     """Return one group number >= 0 per handle, or raise InputError naming what is wrong."""
     given = np.asarray(group)
     if given.shape != (count,) or given.dtype.kind not in "iu":
@@ -167,14 +167,14 @@ def check_groups(group: ArrayLike, count: int) -> Int[np.ndarray, "h"]:
         )
     bad = np.flatnonzero(given < 0)
     if bad.size:
-        raise InputError(f"the group of handle {bad[0]} is {given[bad[0]]}: number them from 0")
+        raise InputError(f"the group of handle {bad[0]} is {given[bad[0]]}: number groups from 0")
     return given.astype(np.int64)
 
 
 def check_rigidity(
     rigidity: ArrayLike, n: int, dtype: np.dtype, *, name: str = "rigidity"
-) -> Float[Array, "n"] | Float[np.ndarray, "n"]:
-    """Return rigidity as one number per vertex, or raise InputError naming what is wrong."""
+) -> Float[Array, "vertices"] | Float[np.ndarray, "vertices"]:
+    """Return the rigidity as one number per vertex, or raise InputError naming what is wrong."""
     array = read_array(rigidity, dtype, name)
     if array.shape not in ((), (n,)):
         raise InputError(
@@ -191,9 +191,9 @@ def check_rigidity(
     return (jnp if isinstance(array, Array) else np).broadcast_to(array, (n,))
 
 
-def rows_of_three(name: str, value: ArrayLike, dtype: np.dtype) -> Float[Array, "n 3"]:
-    """Return finite positions (n, 3), or raise InputError naming the argument."""
+def rows_of_three(name: str, value: ArrayLike, dtype: np.dtype) -> Float[Array, "rows 3"]:
+    """Return finite positions (rows, 3), or raise InputError naming the argument."""
     array = as_array(value, dtype, name)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name} have shape {array.shape}: give (n, 3)")
+        raise InputError(f"{name} have shape {array.shape}: give an array of shape (any, 3)")
     return check_positions(name, array, array.shape, dtype)

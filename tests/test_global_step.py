@@ -14,7 +14,7 @@ from jaxdeform.energy import stiffness
 import jaxdeform as jd
 from jaxdeform import global_step
 from jaxdeform._deformation.initial_guess import normalised_laplacian
-from jaxdeform._linalg import nested_dissection
+from jaxdeform._linalg import elimination_tree
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
 
 
@@ -149,7 +149,7 @@ def test_dissected_factor_refuses_an_indefinite_matrix(accelerator):
 def test_the_cut_does_not_depend_on_the_scale(scale):
     x = jd.shapes.cylinder().vertices
     np.testing.assert_array_equal(
-        nested_dissection._bisect(x * scale, 5), nested_dissection._bisect(x, 5)
+        elimination_tree.bisect(x * scale, 5), elimination_tree.bisect(x, 5)
     )
 
 
@@ -158,9 +158,9 @@ def test_separators_separate():
     matrix, positions = CASES["cylinder"]()
     i, j = sp.coo_matrix(matrix).row.astype(int), sp.coo_matrix(matrix).col.astype(int)
     depth = 5
-    label = nested_dissection._bisect(positions, depth)
+    label = elimination_tree.bisect(positions, depth)
     assert np.ptp(np.bincount(label)) <= 1
-    level, part = nested_dissection._separators(i, j, label, depth)
+    level, part = elimination_tree.separators(i, j, label, depth)
     shallow = np.minimum(level[i], level[j])
     np.testing.assert_array_equal(part[i] >> (level[i] - shallow), part[j] >> (level[j] - shallow))
 
@@ -170,7 +170,7 @@ def test_vertex_cover_is_the_least():
     for _ in range(40):
         edges = np.unique(rng.integers(0, 6, size=(rng.integers(1, 12), 2)), axis=0)
         one, two = edges[:, 0], edges[:, 1] + 6
-        cover = set(nested_dissection._vertex_cover(one, two).tolist())
+        cover = set(elimination_tree.vertex_cover(one, two).tolist())
         covers = lambda c, one=one, two=two: all(  # noqa: E731
             a in c or b in c for a, b in zip(one, two, strict=True)
         )

@@ -1,4 +1,4 @@
-"""Laplacian mesh editing: the baseline of Eq. 3.2."""
+"""Laplacian mesh editing, the baseline of Eq. 3.2."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,21 +18,26 @@ from jaxdeform.errors import ArrayLike, InputError
 class LaplacianEditor(eqx.Module):
     """Laplacian editing, factored for one mesh and handle set; call it with targets (handles, 3).
 
-    Its columns are the vertices (three right-hand sides), or all coordinates (one right-hand side)
-    where the details follow as similarities.
+    Without similarities, the columns of the matrix are the vertices, and the rows of ``pull`` are
+    three right-hand sides. With similarities, the columns are all coordinates, and there is one
+    right-hand side.
     """
 
     rest: Float[Array, "vertices 3"]
     handles: Int[np.ndarray | Array, "handles"]
     free: Bool[Array, "columns"]
+    """True for each unknown."""
     soft: Float[Array, "columns"]
+    """The weight of each soft handle; 0 elsewhere."""
     pull: Float[Array, "rows columns"]
-    """L^T delta, what the details ask for; zero where the similarities carry them."""
+    """L^T delta, the right-hand side of the details; zero where the matrix rotates the details."""
     normal: EllMatrix
+    """The matrix of the normal equations."""
     factor: Factor
+    """The factor of its free-free block."""
 
     def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
-        """Return the edited positions. Differentiable to the targets."""
+        """Return the edited positions, differentiable in the targets (handles, 3)."""
         targets = check_targets(targets, len(self.handles), self.rest.dtype)
         x = self.rest.at[self.handles].set(targets).T.reshape(self.pull.shape)
         fixed = jnp.where(self.free[None], 0.0, x)
@@ -51,19 +56,28 @@ def laplacian_editor(
 ) -> LaplacianEditor:
     """Factor Laplacian mesh editing for a mesh and a set of handles (Eq. 3.1, 3.2).
 
-    Minimises ``sum_i |(L p')_i - T_i delta_i|^2 + sum_h w_h |p'_h - u_h|^2``.
+    The editor minimises ``sum_i |(L p')_i - T_i delta_i|^2 + sum_h w_h |p'_h - u_h|^2``.
+
+    Sorkine, Cohen-Or, Lipman, Alexa, Roessl and Seidel, "Laplacian surface editing" (2004),
+    doi:10.1145/1057432.1057456.
 
     **Arguments**
 
-    - mesh; handles (h,).
-    - weights: (edges,) in the order of ``mesh.edges``; cotangents if left out, ``np.ones`` for the
-      uniform Laplacian.
-    - handle_weights: a number or (h,); infinite (the default) holds the handle on its target.
-    - similarity: False keeps T_i = I: details are not turned, and large rotations distort them.
-      True lets T_i be the linearised similarity that best fits the neighbourhood (Sorkine et al.
-      2004): details turn along, up to about 90 degrees; 3n unknowns at once.
+    - mesh: the rest shape.
+    - handles: (handles,), vertex indices.
+    - weights: (edges,), in the order of ``mesh.edges``; by default cotangent weights. ``np.ones``
+      gives the uniform Laplacian.
+    - handle_weights: a number or (handles,). The default, infinity, keeps the handle on its target.
+    - similarity: False keeps T_i = I, so details do not rotate, and large rotations distort them.
+      True makes T_i the linearised similarity that best fits the neighbourhood (Sorkine et al.
+      2004): details rotate with it, up to about 90 degrees. All coordinates are then solved for at
+      once.
 
-    **Raises** InputError as :func:`precompute`.
+    **Returns** a :class:`LaplacianEditor`.
+
+    **Raises** InputError: no handles; a handle out of range or repeated; a connected component
+    without a handle; weights of the wrong shape or not finite; handles that do not determine the
+    shape.
 
     Example:
         >>> import jaxdeform as jd
@@ -77,7 +91,7 @@ def laplacian_editor(
     cells = spokes(mesh, weights=weights)
     laplacian = normalised_laplacian(cells.edges, cells.weights, n)
     if similarity:
-        operator = sp.kron(sp.identity(3), laplacian) - _turned_details(mesh, laplacian)
+        operator = sp.kron(sp.identity(3), laplacian) - _rotated_details(mesh, laplacian)
         pull = np.zeros((1, 3 * n))
         free, soft = np.tile(free, 3), np.tile(soft, 3)
         positions = np.tile(mesh.vertices, (3, 1))
@@ -90,8 +104,8 @@ def laplacian_editor(
         factor = factorise(normal, free, dtype, positions=positions)
     except NotPositiveDefinite as error:
         raise InputError(
-            "the handles do not determine the shape: hold at least three vertices that are not on "
-            "one line in each connected part"
+            "the handles do not determine the shape: give each connected component at least three "
+            "vertices that are not on one line"
         ) from error
     return LaplacianEditor(
         rest=jnp.asarray(mesh.vertices, dtype),
@@ -106,11 +120,20 @@ def laplacian_editor(
 
 def laplacian_editing(
     mesh: Mesh, handles: ArrayLike, targets: ArrayLike, **settings
-) -> Float[Array, "n 3"]:
-    """Edit a mesh by its Laplacian coordinates, once; for many targets use laplacian_editor.
+) -> Float[Array, "vertices 3"]:
+    """Edit a mesh by its Laplacian coordinates, once. For many targets use laplacian_editor.
 
-    **Arguments**: mesh; handles (h,); targets (h, 3); settings of :func:`laplacian_editor`.
-    **Returns** the positions (n, 3). **Raises** InputError as there.
+    **Arguments**
+
+    - mesh: the rest shape.
+    - handles: (handles,), vertex indices.
+    - targets: (handles, 3), in the unit of the mesh.
+    - settings: those of :func:`laplacian_editor`.
+
+    **Returns** the positions (vertices, 3).
+
+    **Raises** InputError as :func:`laplacian_editor`; also for targets that are not finite or of
+    the wrong shape.
 
     Example:
         >>> import jaxdeform as jd
@@ -122,11 +145,12 @@ def laplacian_editing(
     return laplacian_editor(mesh, handles, **settings)(targets)
 
 
-def _turned_details(mesh: Mesh, laplacian: sp.csr_matrix) -> sp.csr_matrix:
-    """Return M (3n, 3n) with ``(M p')_i = T_i(p') delta_i``, coordinates blockwise (x, y, z).
+def _rotated_details(mesh: Mesh, laplacian: sp.csr_matrix) -> sp.csr_matrix:
+    """Return M with ``(M p')_i = T_i(p') delta_i``, where p' holds all x, then all y, then all z.
 
     ``T_i q = s q + h x q`` fits the centred neighbourhood: ``s = sum q.p' / sum |q|^2`` and
-    ``h = J^-1 sum q x p'`` with ``J = sum |q|^2 I - q q^T`` (Sorkine et al. 2004, in closed form).
+    ``h = J^-1 sum q x p'`` with ``J = sum |q|^2 I - q q^T``. This is the closed form of Sorkine et
+    al. (2004).
     """
     n = mesh.n_vertices
     delta = laplacian @ mesh.vertices
@@ -150,7 +174,7 @@ def _turned_details(mesh: Mesh, laplacian: sp.csr_matrix) -> sp.csr_matrix:
     return sp.csr_matrix((block.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, 3 * n))
 
 
-def _cross_matrices(v: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3 3"]:
+def _cross_matrices(v: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, "rows 3 3"]:
     out = np.zeros((len(v), 3, 3))
     out[:, [2, 0, 1], [1, 2, 0]] = v
     out[:, [1, 2, 0], [2, 0, 1]] = -v

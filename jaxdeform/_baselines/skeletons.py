@@ -12,15 +12,16 @@ from jaxdeform.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Joints and the bones between them. Read by :func:`load_skeleton`."""
+    """Joints and the bones between them; made by :func:`load_skeleton`."""
 
-    joints: Float[np.ndarray, "j 3"]
-    bones: Int[np.ndarray, "m 2"]
+    joints: Float[np.ndarray, "joints 3"]
+    """Positions, in the unit of the file."""
+    bones: Int[np.ndarray, "bones 2"]
     """The two joints of each bone."""
 
     @property
-    def segments(self) -> Float[np.ndarray, "m 2 3"]:
-        """Both ends of each bone: the controls that the weights are made of."""
+    def segments(self) -> Float[np.ndarray, "bones 2 3"]:
+        """Both ends of each bone: the controls of the skinning weights."""
         return self.joints[self.bones]
 
     def __repr__(self) -> str:
@@ -29,15 +30,18 @@ class Skeleton:
 
 
 def load_skeleton(path: str | os.PathLike) -> Skeleton:
-    """Read a skeleton from a ``.tgf`` file (the graphs of Jacobson et al.'s skinning programs).
+    """Read a skeleton from a ``.tgf`` file, a graph as the skinning programs of Jacobson use it.
 
-    Lines ``number x y z`` with the joints, numbered from 1; a line ``#``; lines ``i j`` with the
-    edges, which may go on with three flags (bone, pseudo, cage). Without flags an edge is a bone.
+    The file lists the joints as lines ``number x y z``, numbered from 1; then a line ``#``; then
+    the edges as lines ``i j``, which may end in three flags (bone, pseudo, cage). An edge without
+    flags is a bone.
 
-    **Returns** a :class:`Skeleton` of all joints, and of the edges that are bones.
+    **Arguments**: path of a ``.tgf`` file.
 
-    **Raises** InputError naming the file and the line; also for a bone of length zero and for a
-    file without bones.
+    **Returns** a :class:`Skeleton` with all joints, and with the edges that are bones.
+
+    **Raises** InputError naming the file and the line; also for a bone of length zero and a file
+    without bones.
 
     Example:
         >>> import jaxdeform as jd, pathlib, tempfile
@@ -55,14 +59,14 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
         raise InputError(f"{path}: cannot be read ({error}): check the name") from error
     joints: list[list[float]] = []
     bones: list[list[int]] = []
-    part = 0
+    section = 0
     for number, words in enumerate((line.split() for line in lines), start=1):
         where = f"{path}, line {number}"
         if words[:1] == ["#"]:
-            part += 1
-        elif words and part == 0:
+            section += 1
+        elif words and section == 0:
             joints.append(_joint(where, words, len(joints) + 1))
-        elif words and part == 1:
+        elif words and section == 1:
             i, j, *flags = _edge(where, words, len(joints))
             if not flags or flags[0]:
                 if joints[i] == joints[j]:
@@ -77,7 +81,9 @@ def _joint(where: str, words: list[str], expected: int) -> list[float]:
     try:
         number, position = int(words[0]), [float(word) for word in words[1:]]
     except ValueError:
-        raise InputError(f"{where}: '{' '.join(words)}' is no joint 'number x y z'") from None
+        raise InputError(
+            f"{where}: '{' '.join(words)}' is not a joint: give 'number x y z'"
+        ) from None
     if number != expected or len(position) != 3 or not np.isfinite(position).all():
         raise InputError(f"{where}: expected joint {expected} as '{expected} x y z'")
     return position
@@ -87,7 +93,9 @@ def _edge(where: str, words: list[str], count: int) -> list[int]:
     try:
         i, j, *flags = (int(word) for word in words)
     except ValueError:
-        raise InputError(f"{where}: '{' '.join(words)}' is no edge 'i j'") from None
+        raise InputError(f"{where}: '{' '.join(words)}' is not an edge: give 'i j'") from None
     if not (1 <= i <= count and 1 <= j <= count):
-        raise InputError(f"{where}: edge {i} {j} names a joint out of range 1 to {count}")
+        raise InputError(
+            f"{where}: edge {i} {j} names a joint out of range: joints are 1 to {count}"
+        )
     return [i - 1, j - 1, *flags]

@@ -10,54 +10,69 @@ from jaxdeform._linalg.rotations import (
     quaternions_from_matrices,
     rotation_matrices,
 )
-from jaxdeform.checks import as_array, check_positions, rows_of_three
+from jaxdeform.checks import as_array, check_positions, is_concrete, rows_of_three
 from jaxdeform.errors import ArrayLike, InputError
 
 
 def rigid_transforms(
     rotations: ArrayLike, translations: ArrayLike, centers: ArrayLike
-) -> Float[Array, "m 3 4"]:
-    """Return the matrices of ``p -> R (p - center) + center + t``, one per control.
+) -> Float[Array, "controls 3 4"]:
+    """Return the matrix of ``p -> R (p - center) + center + t`` for each control.
 
-    **Arguments**: rotations (m, 3), rotation vectors (their length is the angle in radians);
-    translations (m, 3); centers (m, 3). **Raises** InputError: shapes that differ.
+    **Arguments**
+
+    - rotations: (controls, 3), rotation vectors: the direction is the axis, the length is the angle
+      in radians.
+    - translations: (controls, 3).
+    - centers: (controls, 3), the centre of each rotation.
+
+    **Returns** (controls, 3, 4): rotation and shift.
+
+    **Raises** InputError: shapes that differ; values that are not finite.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
-        >>> turn = jd.rigid_transforms([[0, 0, np.pi]], [[0, 0, 0]], [[1, 0, 0]])
-        >>> np.allclose(turn[0, :, 3], [2.0, 0.0, 0.0], atol=1e-6)
+        >>> moves = jd.rigid_transforms([[0, 0, np.pi]], [[0, 0, 0]], [[1, 0, 0]])
+        >>> np.allclose(moves[0, :, 3], [2.0, 0.0, 0.0], atol=1e-6)
         True
     """
     dtype = jnp.result_type(float)
     rotations = as_array(rotations, dtype, "rotations")
     if rotations.ndim != 2 or rotations.shape[1] != 3:
-        raise InputError(f"rotations have shape {rotations.shape}: give (m, 3) rotation vectors")
+        raise InputError(
+            f"rotations have shape {rotations.shape}: give (controls, 3) rotation vectors"
+        )
     shape = rotations.shape
     rotations = check_positions("rotations", rotations, shape, dtype, unit="control")
     translations = check_positions("translations", translations, shape, dtype, unit="control")
     centers = check_positions("centers", centers, shape, dtype, unit="control")
-    turn = rotation_matrices(rotations)
-    shift = centers + translations - jnp.einsum("mij,mj->mi", turn, centers, precision="highest")
-    return jnp.concatenate([turn, shift[:, :, None]], axis=2)
+    matrices = rotation_matrices(rotations)
+    shift = (
+        centers + translations - jnp.einsum("mij,mj->mi", matrices, centers, precision="highest")
+    )
+    return jnp.concatenate([matrices, shift[:, :, None]], axis=2)
 
 
 def linear_blend_skinning(
     vertices: ArrayLike, weights: ArrayLike, transforms: ArrayLike
-) -> Float[Array, "n 3"]:
+) -> Float[Array, "vertices 3"]:
     """Return ``p'_i = sum_j w_ij T_j p_i`` (thesis chapter 3).
 
     Affine transformations are blended as matrices, so the blend of two rotations shrinks: a twist
-    of 180 degrees collapses the middle. See :func:`dual_quaternion_skinning`. A pure function of
-    arrays: jit, vmap (over poses), grad and jvp to all arguments.
+    of 180 degrees collapses the middle. :func:`dual_quaternion_skinning` does not shrink. This is a
+    pure function of arrays: use jit, vmap over poses, and grad or jvp in all arguments.
 
     **Arguments**
 
-    - vertices: (n, 3).
-    - weights: (n, m), rows with sum one.
-    - transforms: (m, 3, 4), the matrix and the shift of each control.
+    - vertices: (vertices, 3).
+    - weights: (vertices, controls), each row with sum one.
+    - transforms: (controls, 3, 4), the matrix and the shift of each control.
 
-    **Raises** InputError: shapes that do not fit; a row of weights whose sum is not one; values
-    that are not finite. Values are checked when they are known, shapes also while tracing.
+    **Returns** (vertices, 3).
+
+    **Raises** InputError: shapes that do not fit together; a row of weights whose sum is not one;
+    values that are not finite. Shapes are checked even while JAX traces, values only when they are
+    known.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
@@ -72,23 +87,34 @@ def linear_blend_skinning(
 
 def dual_quaternion_skinning(
     vertices: ArrayLike, weights: ArrayLike, transforms: ArrayLike
-) -> Float[Array, "n 3"]:
-    """Blend rigid transformations as unit dual quaternions (Kavan et al. 2008).
+) -> Float[Array, "vertices 3"]:
+    """Blend rigid transformations as unit dual quaternions.
 
-    The blend of rigid motions is a rigid motion, so nothing shrinks. Of the two quaternions of a
-    rotation, each is taken that lies on the side of the vertex's heaviest control: the shorter way
-    round. Where two controls differ by exactly 180 degrees there is none, and the result jumps;
-    everywhere else it is smooth. Transformable as :func:`linear_blend_skinning`.
+    The blend of rigid motions is a rigid motion, so nothing shrinks. A rotation has two quaternions
+    of opposite sign. For each vertex, the one nearer to the control of largest weight is used,
+    which takes the shorter way round. If two controls differ by exactly 180 degrees, neither way is
+    shorter, and the result jumps there; everywhere else it is smooth. Use it with jit, vmap, grad
+    and jvp, like :func:`linear_blend_skinning`.
 
-    **Arguments** as there; weights >= 0, transforms rigid (rotation and shift).
+    Kavan, Collins, Zara and O'Sullivan, "Geometric skinning with approximate dual quaternion
+    blending" (2008), doi:10.1145/1409625.1409627.
 
-    **Raises** InputError as there; also for negative weights and a matrix that is no rotation.
+    **Arguments**
+
+    - vertices: (vertices, 3).
+    - weights: (vertices, controls), 0 or more, each row with sum one.
+    - transforms: (controls, 3, 4), rigid: the rotation and the shift of each control.
+
+    **Returns** (vertices, 3).
+
+    **Raises** InputError as :func:`linear_blend_skinning`; also for a negative weight and a matrix
+    that is not a rotation.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
         >>> zero = np.zeros((2, 3))
-        >>> turn = jd.rigid_transforms([[0, 0, 0], [0, 0, np.pi / 2]], zero, zero)
-        >>> point = jd.dual_quaternion_skinning([[1.0, 0.0, 0.0]], [[0.5, 0.5]], turn)
+        >>> moves = jd.rigid_transforms([[0, 0, 0], [0, 0, np.pi / 2]], zero, zero)
+        >>> point = jd.dual_quaternion_skinning([[1.0, 0.0, 0.0]], [[0.5, 0.5]], moves)
         >>> bool(abs(np.linalg.norm(point) - 1) < 1e-6)
         True
     """
@@ -97,7 +123,7 @@ def dual_quaternion_skinning(
     real = quaternions_from_matrices(transforms[:, :, :3])
     shift = jnp.concatenate([jnp.zeros_like(real[:, :1]), transforms[:, :, 3]], axis=1)
     dual = 0.5 * quaternion_product(shift, real)
-    # Both signs are the same rotation: the one nearer to the heaviest control's.
+    # q and -q are the same rotation. Take the sign nearer to the control of largest weight.
     nearness = jnp.matmul(real, real.T, precision="highest")
     side = jnp.where(nearness < 0.0, -1.0, 1.0).astype(real.dtype)
     signed = weights * side[jnp.argmax(weights, axis=1)]
@@ -110,13 +136,13 @@ def dual_quaternion_skinning(
     )
 
 
-def _apply(turn, shift, vertices) -> Float[Array, "n 3"]:
-    return jnp.einsum("nij,nj->ni", turn, vertices, precision="highest") + shift
+def _apply(matrices, shift, vertices) -> Float[Array, "vertices 3"]:
+    return jnp.einsum("nij,nj->ni", matrices, vertices, precision="highest") + shift
 
 
-# How far a row of weights may be from one in sum, and R^T R of a rigid matrix from I: what single
-# precision and text files with six digits leave.
-_LOOSE = 1e-5
+# How far the sum of a row of weights may be from one, and R^T R of a rigid matrix from I. This is
+# the error that single precision and text files with six digits leave.
+_ALLOWANCE = 1e-5
 
 
 def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
@@ -124,13 +150,11 @@ def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
     vertices = rows_of_three("vertices", vertices, dtype)
     weights = as_array(weights, dtype, "weights")
     if weights.ndim != 2 or len(weights) != len(vertices):
-        raise InputError(
-            f"weights have shape {weights.shape}: give ({len(vertices)}, m), vertices by controls"
-        )
+        raise InputError(f"weights have shape {weights.shape}: give ({len(vertices)}, controls)")
     weights = check_positions("weights", weights, weights.shape, dtype)
     if is_concrete(weights):
         total = np.asarray(weights).sum(axis=1)
-        bad = np.flatnonzero(np.abs(total - 1.0) > _LOOSE)
+        bad = np.flatnonzero(np.abs(total - 1.0) > _ALLOWANCE)
         if bad.size:
             raise InputError(
                 f"the weights of vertex {bad[0]} sum to {total[bad[0]]:.6g}, not to 1: divide each "
@@ -143,18 +167,18 @@ def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
 def _check_blendable(weights: Array, transforms: Array) -> None:
     if is_concrete(weights):
         low = np.asarray(weights).min(axis=1, initial=0.0)
-        bad = np.flatnonzero(low < -_LOOSE)
+        bad = np.flatnonzero(low < -_ALLOWANCE)
         if bad.size:
             raise InputError(
-                f"a weight of vertex {bad[0]} is {low[bad[0]]:.6g}: dual quaternions blend between "
-                "motions only; give weights of 0 or more, or use linear_blend_skinning"
+                f"a weight of vertex {bad[0]} is {low[bad[0]]:.6g}: dual quaternions blend only "
+                "between motions; give weights of 0 or more, or use linear_blend_skinning"
             )
     if is_concrete(transforms):
-        turn = np.asarray(transforms)[:, :, :3]
-        gap = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max(axis=(1, 2))
-        bad = np.flatnonzero((gap > _LOOSE) | (np.linalg.det(turn) < 0))
+        matrices = np.asarray(transforms)[:, :, :3]
+        gap = np.abs(np.swapaxes(matrices, 1, 2) @ matrices - np.eye(3)).max(axis=(1, 2))
+        bad = np.flatnonzero((gap > _ALLOWANCE) | (np.linalg.det(matrices) < 0))
         if bad.size:
             raise InputError(
-                f"the matrix of control {bad[0]} is no rotation (it stretches, shears or "
+                f"the matrix of control {bad[0]} is not a rotation (it stretches, shears or "
                 "reflects): give rigid motions, or use linear_blend_skinning"
             )

@@ -1,4 +1,4 @@
-"""Weights of skinning: rigid, inverse distance, bounded biharmonic (thesis chapter 3)."""
+"""Skinning weights: rigid, inverse distance, bounded biharmonic (thesis chapter 3)."""
 
 import igl
 import jax
@@ -21,14 +21,16 @@ from jaxdeform.errors import ArrayLike, InputError
 
 def rigid_weights(
     vertices: ArrayLike, controls: ArrayLike, *, distances: ArrayLike | None = None
-) -> Float[Array, "n m"]:
+) -> Float[Array, "vertices controls"]:
     """Return weight 1 for the nearest control and 0 for the others (thesis chapter 3).
 
-    Of controls equally near, the first takes all, so that the weights sum to one.
+    If several controls are equally near, the first gets all the weight, so each row sums to one.
 
-    **Arguments** as in :func:`inverse_distance_weights`, but for the power.
+    **Arguments**: vertices, controls and distances as in :func:`inverse_distance_weights`.
 
-    **Raises** InputError as there.
+    **Returns** (vertices, controls) weights.
+
+    **Raises** InputError as :func:`inverse_distance_weights`.
 
     Example:
         >>> import jaxdeform as jd
@@ -45,21 +47,25 @@ def inverse_distance_weights(
     power: ArrayLike = 2.0,
     *,
     distances: ArrayLike | None = None,
-) -> Float[Array, "n m"]:
+) -> Float[Array, "vertices controls"]:
     """Return weights proportional to ``1 / distance^power``, with sum one (thesis chapter 3).
 
-    A vertex on a control belongs to it alone (in equal parts to all that it lies on). Traceable,
-    and differentiable to all arguments.
+    A vertex on a control belongs to it alone; a vertex on several controls is shared equally. JAX
+    can trace this function, and it is differentiable in all arguments.
 
     **Arguments**
 
-    - vertices: (n, 3).
-    - controls: points (m, 3), or bones (m, 2, 3), whose distance is that of the segment.
-    - power: a number > 0; the larger, the closer to :func:`rigid_weights`.
-    - distances: (n, m), used instead of the Euclidean ones, as from :func:`geodesic_distances`.
+    - vertices: (vertices, 3).
+    - controls: points (controls, 3), or bones (controls, 2, 3), whose distance is that of the
+      segment.
+    - power: a number above 0. A larger power gives weights closer to :func:`rigid_weights`.
+    - distances: (vertices, controls), used instead of Euclidean distances; for instance from
+      :func:`geodesic_distances`.
 
-    **Raises** InputError: wrong shapes; values that are not finite; a bone of length zero; a power
-    of 0 or less; a vertex at infinite distance from every control.
+    **Returns** (vertices, controls) weights.
+
+    **Raises** InputError: a shape is wrong; a value is not finite; a bone has length zero; the
+    power is 0 or less; a vertex is at infinite distance from every control.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
@@ -73,23 +79,29 @@ def inverse_distance_weights(
     if power.ndim or (is_concrete(power) and not (0 < float(power) < np.inf)):
         raise InputError(f"power is {power}: give one finite number above 0")
     on = squares == 0
-    # A softmax of logarithms, because 1 / d^power overflows for small d.
+    # Use a softmax of logarithms, because 1 / d^power overflows for small d.
     logits = -0.5 * power * jnp.log(jnp.where(on, 1.0, squares))
     hits = jnp.sum(on, axis=1, keepdims=True, dtype=squares.dtype)
     alone = on.astype(squares.dtype) / jnp.maximum(hits, 1.0)
     return jnp.where(hits > 0, alone, jax.nn.softmax(logits, axis=1))
 
 
-def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "n m"]:
-    """Return the distance along the surface from every vertex to each of m vertices.
+def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "vertices controls"]:
+    """Return the distance along the surface from every vertex to each source.
 
-    Exact on the polyhedron (Mitchell et al. 1987; libigl). Infinite between parts of the mesh that
-    are not connected. On a cactus of 5,300 vertices a source takes 0.7 s.
+    The distance is exact on the polyhedron, and infinite between different connected components.
+    libigl computes it by the method of Mitchell, Mount and Papadimitriou, "The discrete geodesic
+    problem" (1987), doi:10.1137/0216045. On a cactus of 5,300 vertices, one source takes 0.7 s.
 
-    **Arguments**: mesh; sources (m,) vertex indices.
+    **Arguments**
 
-    **Raises** InputError: a source out of range or repeated; a mesh with an edge of more than two
-    faces, or whose surfaces meet in a single vertex (libigl would crash or return zeros).
+    - mesh: the surface, closed or open.
+    - sources: (controls,), vertex indices.
+
+    **Returns** (vertices, controls), in the unit of the mesh.
+
+    **Raises** InputError: a source is out of range or repeated; an edge has more than two faces, or
+    surfaces meet in a single vertex (libigl would crash or return zeros).
 
     Example:
         >>> import jaxdeform as jd
@@ -105,7 +117,7 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "n m
     out = np.full((mesh.n_vertices, len(index)), np.inf)
     none = np.array([], np.int64)
     for k, source in enumerate(index):
-        # libigl says 0 where there is no way, so only those with one are asked for.
+        # Where no path exists libigl returns 0, so ask only for vertices that have one.
         reached = np.flatnonzero(label == label[source])
         if len(reached) > 1:
             out[reached, k] = igl.exact_geodesic(
@@ -117,22 +129,28 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "n m
 
 def bounded_biharmonic_weights(
     mesh: Mesh, handles: ArrayLike, group: ArrayLike | None = None
-) -> Float[Array, "n m"]:
-    """Return bounded biharmonic weights (Jacobson et al. 2011) on the surface of a mesh.
+) -> Float[Array, "vertices controls"]:
+    """Return bounded biharmonic weights on the surface of a mesh.
 
-    ``w_j`` minimises ``integral |Laplacian w_j|^2`` with ``0 <= w_j <= 1``, 1 on its own handles
-    and 0 on those of the others; the rows are then divided by their sums, which are near one. They
-    are smooth and follow the shape. The paper solves them in the volume; here the domain is the
-    surface, so controls are vertices of it.
+    ``w_j`` minimises ``integral |Laplacian w_j|^2`` with ``0 <= w_j <= 1``. It is 1 on the handles
+    of control j and 0 on those of the other controls. Each row is then divided by its sum, which is
+    near one. The weights are smooth and follow the shape. The paper solves for them in the volume;
+    here the domain is the surface, so the controls are vertices of it.
+
+    Jacobson, Baran, Popovic and Sorkine, "Bounded biharmonic weights for real-time deformation"
+    (2011), doi:10.1145/2010324.1964973.
 
     **Arguments**
 
     - mesh: the surface, closed or open.
-    - handles: (h,) vertex indices.
-    - group: (h,) the control that each handle belongs to, 0 to m - 1; each its own if left out.
+    - handles: (handles,), vertex indices.
+    - group: (handles,), the control of each handle, numbered from 0; by default each handle is a
+      control.
 
-    **Raises** InputError: a handle out of range or repeated; a group without handles; a connected
-    part without handles; unreferenced vertices (all of which crash libigl or come out as NaN).
+    **Returns** (vertices, controls) weights.
+
+    **Raises** InputError: a handle is out of range or repeated; a group has no handles; a connected
+    component has no handle; a vertex belongs to no face (libigl would crash or return NaN).
 
     Example:
         >>> import jaxdeform as jd
@@ -144,14 +162,14 @@ def bounded_biharmonic_weights(
     count = int(group.max()) + 1
     empty = np.setdiff1d(np.arange(count), group)
     if empty.size:
-        raise InputError(f"group {empty[0]} has no handles: number the groups 0 to m - 1")
+        raise InputError(f"group {empty[0]} has no handles: number the groups from 0, without gaps")
     if not mesh.referenced.all():
         raise InputError(
             f"vertex {np.flatnonzero(~mesh.referenced)[0]} belongs to no face, so no weight "
             "reaches it: drop such vertices with jd.repair(mesh)"
         )
     check_components(mesh, index)
-    # To unit size, because libigl's tolerances are absolute.
+    # Scale to unit size, because the tolerances of libigl are absolute.
     points = mesh.vertices - mesh.vertices.mean(axis=0)
     points = points / np.abs(points).max()
     weights = igl.bbw(points, np.ascontiguousarray(mesh.faces), index, np.eye(count)[group])
@@ -159,20 +177,21 @@ def bounded_biharmonic_weights(
     total = weights.sum(axis=1, keepdims=True)
     if not np.isfinite(total).all() or total.min() < 0.1:
         raise InputError(
-            "the biharmonic system could not be solved: the mesh has triangles too thin for it; "
-            "see jd.inspect(mesh)"
+            "the biharmonic system could not be solved, because some triangles are too thin: see "
+            "jd.inspect(mesh)"
         )
     return jnp.asarray(weights / total, jnp.result_type(float))
 
 
-def _squares(vertices, controls, distances) -> Float[Array, "n m"]:
-    """Squared distances from vertices to points or segments, or those that were given."""
+def _squares(vertices, controls, distances) -> Float[Array, "vertices controls"]:
+    """Return squared distances to points or segments, or the squares of given distances."""
     dtype = jnp.result_type(float)
     vertices = rows_of_three("vertices", vertices, dtype)
     ends = as_array(controls, dtype, "controls")
     if ends.ndim not in (2, 3) or ends.shape[1:] not in ((3,), (2, 3)) or not len(ends):
         raise InputError(
-            f"controls have shape {ends.shape}: give points (m, 3) or bones (m, 2, 3), m >= 1"
+            f"controls have shape {ends.shape}: give points (controls, 3) or bones "
+            "(controls, 2, 3), at least one"
         )
     ends = check_positions("controls", ends, ends.shape, dtype, unit="control")
     n, m = len(vertices), len(ends)
@@ -185,29 +204,31 @@ def _squares(vertices, controls, distances) -> Float[Array, "n m"]:
     if is_concrete(square) and not np.asarray(square).all():
         raise InputError(
             f"bone {np.flatnonzero(np.asarray(square) == 0)[0]} has length zero: give two "
-            "different ends, or points (m, 3)"
+            "different ends, or points (controls, 3)"
         )
     arm = vertices[:, None] - ends[None, :, 0]
-    part = jnp.clip(
+    fraction = jnp.clip(
         jnp.einsum("nmi,mi->nm", arm, along / square[:, None], precision="highest"), 0.0, 1.0
     )
-    return jnp.sum((arm - part[:, :, None] * along[None]) ** 2, axis=2)
+    return jnp.sum((arm - fraction[:, :, None] * along[None]) ** 2, axis=2)
 
 
-def _given_squares(distances: Array, shape: tuple[int, int]) -> Float[Array, "n m"]:
+def _given_squares(distances: Array, shape: tuple[int, int]) -> Float[Array, "vertices controls"]:
     if distances.shape != shape:
         raise InputError(
-            f"distances have shape {distances.shape}, expected {shape}: vertices by controls"
+            f"distances have shape {distances.shape}: give {shape}, vertices by controls"
         )
     if is_concrete(distances):
         values = np.asarray(distances)
         bad = np.argwhere(~(values >= 0))
         if bad.size:
             i, j = bad[0]
-            raise InputError(f"the distance of vertex {i} to control {j} is {values[i, j]}")
+            raise InputError(
+                f"the distance of vertex {i} to control {j} is {values[i, j]}: give 0 or more"
+            )
         far = np.flatnonzero(np.isinf(values).all(axis=1))
         if far.size:
             raise InputError(
-                f"vertex {far[0]} is connected to no control: put one on its part of the mesh"
+                f"vertex {far[0]} is connected to no control: put one on its connected component"
             )
     return distances**2

@@ -1,4 +1,4 @@
-"""The energy of one cell (Eq. 4.2), its gradient and Hessian."""
+"""The energy of a cell (Eq. 4.2), its gradient and Hessian."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -7,7 +7,7 @@ from jaxdeform._linalg.small_matrices import Grid, minus_identity, product, tran
 
 
 def cell_energy(t, c, b, lam):
-    """Eq. 4.2 for one cell, (3, 3); the form that jaxopt and the thesis's descent see."""
+    """Eq. 4.2 for one cell, with matrices (3, 3): the form for jaxopt and the thesis's descent."""
     strain = jnp.matmul(t.T, t, precision="highest") - jnp.eye(3, dtype=t.dtype)
     return lam * jnp.sum(strain**2) + jnp.sum(t**2 * b[None, :]) - 2.0 * jnp.sum(t * c.T)
 
@@ -27,7 +27,7 @@ def half_gradient(x: Grid, m: Grid, b: list[Array], lam: Array) -> Grid:
 
 
 def half_hessian(x: Grid, b: list[Array], lam: Array) -> list[list[Array]]:
-    """Half the Hessian of phi at X as a full 9x9 (only its lower half is read)."""
+    """Half the Hessian of phi at X as a full 9x9 matrix. (Only its lower half is used.)"""
     gram, outer = product(transpose(x), x), product(x, transpose(x))
     rows: list[list[Array]] = []
     for i in range(3):

@@ -1,4 +1,4 @@
-"""Newton's method on every cell: block steps for all, exact steps for the few that need them."""
+"""Newton's method for every cell: block steps for all, exact steps for the few that need them."""
 
 from functools import partial
 
@@ -23,7 +23,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 def gradient_tolerance(m: Grid, lam: Array) -> Array:
-    """Gradient norm at which a cell is done: 4e-10 (float64) or 1e-5 (float32) of its scale."""
+    """Return the gradient norm of a solved cell: 4e-10 (float64) or 1e-5 (float32) of its scale."""
     eps = jnp.finfo(lam.dtype).eps
     return (4e-10 + 100.0 * eps) * (lam + _norm(m)) + jnp.finfo(lam.dtype).tiny
 
@@ -34,41 +34,41 @@ def _norm(g: Grid) -> Array:
 
 def block_newton(
     m: Grid, b: list[Array], lam: Scalars, tolerance: Scalars
-) -> tuple[Grid, Bool[Array, "n"]]:
-    """Quasi-Newton with the block diagonal of the Hessian; also tell who is not done.
+) -> tuple[Grid, Bool[Array, "cells"]]:
+    """Quasi-Newton with the block diagonal of the Hessian; also return which cells are unsolved.
 
-    Where X and B are diagonal the blocks ARE the Hessian, and they stay close: from the start
-    below, half of 50,298 cells with strains of 5 % are done after three steps, seven in eight after
-    four, all after eight (from X = I each takes two more). A step costs 1 ms for 51,200 cells, an
-    exact one 13 ms. Once one cell in eight is left, these are gone on with by themselves (on small
-    meshes it would only be more to compile). Cells that stop getting better are left to the exact
-    steps.
+    If X and B are diagonal, the blocks are the whole Hessian, and otherwise they are close to it.
+    From the start below, half of 50,298 cells with strains of 5 % are solved after three steps,
+    seven in eight after four, all after eight (from X = I each takes two more). A step costs 1 ms
+    for 51,200 cells, an exact one 13 ms. When no more than an eighth of the cells remain, gather
+    them and iterate on those alone. (On small meshes this would only add compile time.) Cells that
+    stop improving are left to the exact steps.
     """
     n = lam.shape[0]
     x, data = _diagonal_start(m, b, lam), (m, b, lam, tolerance)
     few = n // 8 if n > SMALL else 0
-    x, waiting = _block_steps(x, *data, leave=few)
+    x, unsolved = _block_steps(x, *data, leave=few)
     if few:
         again = lambda state, *data: _block_steps(state[0], *data, leave=0)  # noqa: E731
-        x, waiting = on_few(again, waiting, few, (x, waiting), *data)
-    return x, waiting
+        x, unsolved = on_few(again, unsolved, few, (x, unsolved), *data)
+    return x, unsolved
 
 
 def _diagonal_start(m: Grid, b: list[Array], lam: Scalars) -> Grid:
-    """Solve for X as if m were diagonal (three cubics), then once for what is beside it.
+    """Solve for X as if M were diagonal (three cubics), then once for the off-diagonal entries.
 
-    The cubics are followed by Newton from 1, the rotation, without leaving its basin.
+    Newton's method solves the cubics from 1, the rotation, and stays in its basin.
     """
     tiny = _tiny(b, lam)
 
     def newton(_, diagonal):
         slope = [2.0 * lam * (3.0 * y * y - 1.0) + b[i] + tiny for i, y in enumerate(diagonal)]
         force = [2.0 * lam * (y * y - 1.0) * y + b[i] * y - m[i][i] for i, y in enumerate(diagonal)]
-        # At 0.577 the slope of the cubic vanishes.
+        # Stay above 0.577, where the slope of the cubic vanishes.
         return [jnp.maximum(diagonal[i] - force[i] / slope[i], 0.6) for i in range(3)]
 
     x = identity(lam)
-    # A loop, or the compiler would repeat these in each of the six entries that follow.
+    # Without a loop, the compiler would repeat these steps for each of the six entries below.
     for i, y in enumerate(jax.lax.fori_loop(0, 3, newton, [x[i][i] for i in range(3)])):
         x[i][i] = y
     for i, j in _PAIRS:
@@ -80,11 +80,11 @@ def _diagonal_start(m: Grid, b: list[Array], lam: Scalars) -> Grid:
 
 def _block_steps(
     x: Grid, m: Grid, b: list[Array], lam: Scalars, tolerance: Scalars, leave: int
-) -> tuple[Grid, Bool[Array, "n"]]:
-    """Take up to 30 steps, until all cells but ``leave`` are done or stuck; tell who is not done.
+) -> tuple[Grid, Bool[Array, "cells"]]:
+    """Take up to 30 steps, until at most ``leave`` cells are left; return which are unsolved.
 
-    A step is written so that nothing but X is kept: the compiler then makes one pass over the cells
-    for each of its nine entries, which is a third faster than keeping the gradient too.
+    A step keeps nothing but X. The compiler then makes one pass over the cells for each of its nine
+    entries, which is a third faster than keeping the gradient too.
     """
     tiny = _tiny(b, lam)
 
@@ -92,7 +92,7 @@ def _block_steps(
         step, x, last, busy = state
         g = half_gradient(x, m, b, lam)
         size = _norm(g)
-        # A gradient that does not shrink means a poor model here: freeze the cell for later.
+        # If the gradient does not shrink, the model is poor here: leave the cell to exact steps.
         busy = busy & (size < 0.9 * last) & (size > tolerance)
         gram, outer = product(transpose(x), x), product(x, transpose(x))
 
@@ -108,8 +108,8 @@ def _block_steps(
             pair = _pair(stiff(i, j), stiff(j, i), cross, g[i][j], g[j][i], tiny)
             move[i][j], move[j][i] = pair
         y = [[x[i][j] - move[i][j] for j in range(3)] for i in range(3)]
-        # Convergence is linear, so whom this step takes there is known before: a turn less. (Should
-        # it come out otherwise, the check at the end will tell.)
+        # Convergence is linear, so we can predict which cells this step will finish and skip the
+        # iteration that would only confirm it. The final check catches mispredictions.
         arrives = 4.0 * size * size < tolerance * last
         return step + 1, where(busy, y, x), size, busy & ~(arrives & jnp.isfinite(last))
 
@@ -128,7 +128,7 @@ def _pair(hi, hj, cross, gi, gj, tiny) -> tuple[Array, Array]:
 
 
 def _tiny(b: list[Array], lam: Scalars) -> Scalars:
-    """A stiffness that is none, next to that of the cell."""
+    """A stiffness negligible for this cell."""
     info = jnp.finfo(lam.dtype)
     return info.eps * (lam + jnp.abs(b[0]) + jnp.abs(b[1]) + jnp.abs(b[2])) + info.tiny
 
@@ -141,8 +141,8 @@ def exact_newton(max_steps: int, x: Grid, m: Grid, b: list[Array], lam, toleranc
 def _newton_cell(max_steps: int, x, m, b, lam, tolerance) -> Float[Array, "3 3"]:
     """Levenberg-damped Newton with the 9x9 Hessian; a step that raises the energy is refused.
 
-    Should the quasi-Newton steps have ended above the energy of the rotation (they may, at extreme
-    strain), the cell starts again from there, X = I.
+    At extreme strain the quasi-Newton steps may end above the energy of the rotation, X = I. The
+    cell then starts again from X = I.
     """
     identity = jnp.eye(3, dtype=x.dtype)
     eps = jnp.finfo(x.dtype).eps
@@ -155,11 +155,11 @@ def _newton_cell(max_steps: int, x, m, b, lam, tolerance) -> Float[Array, "3 3"]
     def advance(state):
         step, x, before, damping = state
         matrix = jax.jacfwd(half_gradient)(x).reshape(9, 9) + damping * jnp.eye(9, dtype=x.dtype)
-        factor = jax.lax.linalg.cholesky(matrix)  # not a number unless positive definite
+        factor = jax.lax.linalg.cholesky(matrix)  # NaN unless positive definite
         move = jax.scipy.linalg.cho_solve((factor, True), half_gradient(x).reshape(9))
         move = move.reshape(3, 3)
         after = cell_energy(x - move, m, b, lam)
-        # Near the minimum two energies differ by rounding alone, hence the allowance.
+        # The allowance is for rounding: near the minimum, energies differ by nothing else.
         good = after <= before + 8.0 * eps * scale
         raised = jnp.maximum(4.0 * damping, 1e-3 * scale)
         lowered = jnp.where(damping > 1e-6 * scale, 0.1 * damping, 0.0)

@@ -1,4 +1,4 @@
-"""Handle files: JSON, and the .sel/.def pairs of Botsch and Sorkine's survey."""
+"""Handle files: JSON, and the .sel/.def pairs of the survey of Botsch and Sorkine (2008)."""
 
 import json
 import os
@@ -15,10 +15,12 @@ from jaxdeform.errors import InputError
 
 
 class HandleFile(NamedTuple):
-    """Handles as a file gives them."""
+    """Handles and their targets, as a file gives them."""
 
-    handles: Int[np.ndarray, "h"]
-    targets: Float[np.ndarray, "h 3"]
+    handles: Int[np.ndarray, "handles"]
+    """Vertex indices."""
+    targets: Float[np.ndarray, "handles 3"]
+    """Where each handle moves to, in the unit of the mesh."""
 
 
 def load_handles(
@@ -26,20 +28,25 @@ def load_handles(
 ) -> HandleFile:
     """Read handles and their targets from a file.
 
-    Two formats:
+    There are two formats:
 
-    - ``.json``: ``{"handles": [{"vertices": [0, 1], ...}, ...]}``, each group with any of
-      ``"rotation": {"axis": [0, 1, 0], "degrees": 90, "center": [0, 0, 0]}`` (centre: the group's
-      centroid if left out), ``"translation": [1, 0, 0]``, or ``"targets": [[x, y, z], ...]``.
-      A group with none of them stays where it is.
-    - ``.sel`` with ``.def`` (survey of Botsch and Sorkine 2008): a number per vertex, 0 fixed,
-      1 free, 2 handle, and the 4x4 matrix of the handle. The .def beside the .sel is taken.
+    - ``.json``: ``{"handles": [{"vertices": [0, 1], ...}, ...]}``. A group may have
+      ``"rotation": {"axis": [0, 1, 0], "degrees": 90, "center": [0, 0, 0]}`` (by default the centre
+      is the centroid of the group), ``"translation": [1, 0, 0]``, or both, or instead
+      ``"targets": [[x, y, z], ...]``. A group with none of them stays where it is.
+    - ``.sel`` with ``.def``: one number per vertex (0 fixed, 1 free, 2 handle), and the 4x4 matrix
+      of the handle. Format of Botsch and Sorkine, "On linear variational surface deformation
+      methods" (2008), doi:10.1109/TVCG.2007.1054.
 
-    **Arguments**: path; mesh, whose rest positions the motions apply to; motion, another .def file.
+    **Arguments**
 
-    **Returns** (handles (h,), targets (h, 3)).
+    - path: a ``.json`` or ``.sel`` file.
+    - mesh: its rest positions are what the motions apply to.
+    - motion: the ``.def`` file; by default the one with the name of the ``.sel`` file.
 
-    **Raises** InputError naming the file and the group or line.
+    **Returns** a :class:`HandleFile`: handles (handles,) and targets (handles, 3).
+
+    **Raises** InputError naming the file, and the group or vertex.
 
     Example:
         >>> import jaxdeform as jd, json, pathlib, tempfile
@@ -72,17 +79,17 @@ def _read_text(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): check the name") from error
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is no text file: is it another kind of file?") from None
+        raise InputError(f"{path}: is not a text file: give a .json, .sel or .def file") from None
 
 
 def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     try:
         content = json.loads(_read_text(path))
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({error}): mend it there") from error
+        raise InputError(f"{path}: is not valid JSON ({error}): correct it there") from error
     groups = content.get("handles") if isinstance(content, dict) else None
     if not isinstance(groups, list) or not groups:
-        raise InputError(f'{path}: give {{"handles": [group, ...]}}, with one group at least')
+        raise InputError(f'{path}: give {{"handles": [group, ...]}}, with at least one group')
     handles, targets = [], []
     for number, group in enumerate(groups):
         where = f"{path}: group {number}"
@@ -110,19 +117,19 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
             raise InputError(f"{where} has targets and a motion: give one of them")
         return _numbers(where, "targets", group["targets"], points.shape)
     if "rotation" in group:
-        turn = group["rotation"]
-        if not isinstance(turn, dict) or "degrees" not in turn or "axis" not in turn:
+        given = group["rotation"]
+        if not isinstance(given, dict) or "degrees" not in given or "axis" not in given:
             raise InputError(f'{where}: rotation needs "axis" and "degrees"')
-        _check_keys(f"{where}: rotation", turn, "axis", "degrees", "center")
-        axis = _numbers(where, "axis", turn["axis"], (3,))
+        _check_keys(f"{where}: rotation", given, "axis", "degrees", "center")
+        axis = _numbers(where, "axis", given["axis"], (3,))
         length = np.linalg.norm(axis)
         if length == 0:
             raise InputError(f"{where}: the rotation axis has length zero: give a direction")
-        degrees = _numbers(where, "degrees", turn["degrees"], ())
+        degrees = _numbers(where, "degrees", given["degrees"], ())
         center = points.mean(axis=0)
-        if "center" in turn:
-            center = _numbers(where, "center", turn["center"], (3,))
-        # scipy's rotation is double precision, whatever JAX is set to.
+        if "center" in given:
+            center = _numbers(where, "center", given["center"], (3,))
+        # SciPy rotates in double precision, whatever JAX is set to.
         rotation = Rotation.from_rotvec(axis / length * np.radians(degrees))
         points = rotation.apply(points - center) + center
     if "translation" in group:
@@ -145,13 +152,14 @@ def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.
     status = np.array([word for row in _words(path) for word in row])
     if len(status) != mesh.n_vertices:
         raise InputError(
-            f"{path}: has {len(status)} numbers, the mesh {mesh.n_vertices} vertices: is it of "
-            "another mesh?"
+            f"{path}: has {len(status)} numbers, but the mesh has {mesh.n_vertices} vertices: give "
+            "the file of this mesh"
         )
     strange = np.flatnonzero(~np.isin(status, ["0", "1", "2"]))
     if strange.size:
         raise InputError(
-            f"{path}: vertex {strange[0]} is '{status[strange[0]]}': 0 fixed, 1 free, 2 handle"
+            f"{path}: vertex {strange[0]} is '{status[strange[0]]}': give 0 (fixed), 1 (free) or 2 "
+            "(handle)"
         )
     matrix = _numbers(str(motion), "the matrix", _words(motion), (4, 4))
     if matrix[3].tolist() != [0, 0, 0, 1]:
@@ -167,6 +175,6 @@ def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.
 
 
 def _words(path: Path) -> list[list[str]]:
-    """Return the words of each line, without comments and empty lines."""
+    """Return the words of each line; comments and empty lines are left out."""
     rows = [line.split("#")[0].split() for line in _read_text(path).splitlines()]
     return [row for row in rows if row]

@@ -1,13 +1,13 @@
 """Preconditioned L-BFGS for one minimisation or a queue of them.
 
-The engine behind :class:`QuasiNewton`. All it knows of meshes is that positions are (3, vertices)
-and that A^-1 is there to precondition with.
+This is the engine behind :class:`QuasiNewton`. All it knows about meshes is that positions are
+(3, vertices) and that A^-1 serves as the preconditioner.
 
-A queue, not a common loop. Under vmap the general rule for loops runs every member of the batch
-until the slowest is done, and selects between old and new values of everything in every iteration:
-with 64 bars, of which the slowest takes twice the mean, 6 times as long per bar as one bar alone.
-Here the batch is a queue instead. A few slots iterate together, and a slot whose member is done
-takes the next one.
+Under vmap, the general rule for loops would run every member of the batch until the slowest is
+done, and select between old and new values of everything in every iteration. For 64 bars, of which
+the slowest takes twice the mean, each bar then takes 6 times as long as one bar alone. Here the
+batch is a queue instead: a few slots iterate together, and a slot whose member is done takes the
+next one.
 """
 
 from collections.abc import Callable
@@ -22,19 +22,19 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._linalg.cholesky import has_accelerator
 from jaxdeform._linalg.xla import after_reads, without_fusion
 
-# Slots: members of the batch that iterate together. More slots wait longer for each other at the
-# end and outgrow the caches; fewer leave the cores idle. Each of 64 bars takes 10.5, 10.3, 11.2,
-# 13.7 and 16.1 ms with 8, 12, 16, 24 and 32 slots. Going down to 4 slots once the queue is empty
-# would take a tenth off, and twice as long to compile.
+# How many members of the batch iterate together. More slots wait longer for each other at the end
+# and outgrow the caches; fewer leave cores idle. Each of 64 bars takes 10.5, 10.3, 11.2, 13.7 and
+# 16.1 ms with 8, 12, 16, 24 and 32 slots. Tried: going down to 4 slots once the queue is empty. It
+# would save a tenth of the time but take twice as long to compile.
 SLOTS = 12
 
-# On an accelerator, as many slots as have this many vertices together, which fills it. Their arrays
-# then take about 4 GB in float64. (Reasoned, not measured: no accelerator was at hand.)
+# On an accelerator, use as many slots as have this many vertices in total, enough to fill it. Their
+# arrays then take about 4 GB in float64. (Estimated, not measured: no accelerator was available.)
 VERTICES_AT_ONCE = 1 << 22
 
 
 class Settings(NamedTuple):
-    """When to stop, and how much to remember; see :class:`QuasiNewton`."""
+    """When to stop, and how many steps to remember; see :class:`QuasiNewton`."""
 
     tolerance: float
     max_steps: int
@@ -42,14 +42,14 @@ class Settings(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What one evaluation at p tells, for one p or for a batch of them."""
+    """The result of an evaluation at p, for one p or for a batch (the last axis)."""
 
-    transforms: Float[Array, "3 3 vertices *w"]
-    gradient: Float[Array, "3 vertices *w"]
-    """Half the gradient of the reduced energy, 0 at fixed vertices: A p - K^T T."""
-    energy: Float[Array, "*w"]
-    rounding: Float[Array, "*w"]
-    """Two energies closer than this differ by rounding alone."""
+    transforms: Float[Array, "3 3 vertices *batch"]
+    gradient: Float[Array, "3 vertices *batch"]
+    """Half the gradient of the reduced energy, A p - K^T T; 0 at fixed vertices."""
+    energy: Float[Array, "*batch"]
+    rounding: Float[Array, "*batch"]
+    """Two energies that differ by less than this differ only by rounding."""
 
 
 class Minimum(NamedTuple):
@@ -58,13 +58,13 @@ class Minimum(NamedTuple):
     p: Float[Array, "3 vertices"]
     transforms: Float[Array, "3 3 vertices"]
     energy: Float[Array, "history"]
-    """At the start and after each step; anything behind the last."""
+    """At the start and after each step; undefined beyond the last step."""
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
 
 def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."]:
-    """Whether a plain step is expected to gain less than the tolerance, or than can be computed.
+    """Return whether a plain step would gain less than the tolerance, or less than rounding hides.
 
     The gain <g, A^-1 g> is a square, so it is known far more exactly than the energy itself.
     """
@@ -79,10 +79,10 @@ def minimize(
     start: Float[Array, "3 vertices"],
     settings: Settings,
 ) -> Minimum:
-    """Minimise from a start; under vmap over ``inputs`` and ``start``, as a queue through slots.
+    """Minimise from a start. Under vmap over ``inputs`` and ``start``, run the batch as a queue.
 
-    ``evaluate(system, inputs, p)`` evaluates a batch, which is the last axis of all it takes and
-    returns. ``system.factor.solve`` is A^-1.
+    ``evaluate(system, inputs, p)`` evaluates a batch, which is the last axis of ``inputs``, ``p``
+    and the result. ``system.factor.solve`` applies A^-1.
     """
 
     @custom_vmap
@@ -92,7 +92,7 @@ def minimize(
     @batch.def_vmap
     def larger_batch(size, is_batched, system, *own):
         if any(jax.tree.leaves(is_batched[0])):
-            raise NotImplementedError("vmap over problems: they differ in structure; loop instead")
+            raise NotImplementedError("vmap over problems: they differ in structure; use a loop")
         spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
         own = jax.tree.map(spread, own, tuple(is_batched[1:]))
         each = own[-1].shape[1]
@@ -105,41 +105,44 @@ def minimize(
 
 
 class _Memory(NamedTuple):
-    """The last steps of each slot: s (steps) and z = A^-1 y (y: change of gradient).
+    """The last steps s of each slot, and z = A^-1 y, where y is the change of the gradient.
 
-    The large arrays are a ring; what the two-loop recursion needs of their products is kept from
-    the oldest to the newest, so that a direction costs two passes over each large array.
+    The large arrays are ring buffers. The inner products that the two-loop recursion needs are kept
+    in order of age, oldest first, so that a direction costs two passes over each large array.
     """
 
-    s: Float[Array, "w m 3 vertices"]
-    z: Float[Array, "w m 3 vertices"]
-    filled: Bool[Array, "w m"]
-    sy: Float[Array, "w m m"]
-    """s_i . y_j for i no newer than j, else 0."""
-    yzy: Float[Array, "w m m"]
-    sg: Float[Array, "w m"]
-    """s_i . g at the slot's point."""
-    zg: Float[Array, "w m"]
+    s: Float[Array, "slots steps 3 vertices"]
+    z: Float[Array, "slots steps 3 vertices"]
+    filled: Bool[Array, "slots steps"]
+    sy: Float[Array, "slots steps steps"]
+    """s_i . y_j if step i is not newer than step j, else 0."""
+    yzy: Float[Array, "slots steps steps"]
+    """y_i . z_j."""
+    sg: Float[Array, "slots steps"]
+    """s_i . g, with the gradient g at the position of the slot."""
+    zg: Float[Array, "slots steps"]
+    """z_i . g."""
 
 
 class _Slots(NamedTuple):
-    """The members at work: an accepted position each, and what was evaluated there.
+    """The members at work: the accepted position of each, and the evaluation there.
 
-    The slots come first, since products with the memory are slot by slot; in ``at`` they come last,
-    since an evaluation is vertex by vertex (ell.py).
+    The slots are the first axis, because products with the memory go slot by slot. In ``at`` they
+    are the last axis, because an evaluation goes vertex by vertex (ell.py).
     """
 
-    p: Float[Array, "w 3 vertices"]
+    p: Float[Array, "slots 3 vertices"]
     at: Sample
-    z: Float[Array, "w 3 vertices"]
-    """A^-1 gradient: the plain step, negated."""
-    gain: Float[Array, "w"]
-    """<gradient, z>: twice what a plain step is expected to gain."""
-    iteration: Int[Array, "w"]
-    """Evaluations done."""
-    history: Float[Array, "w history"]
+    z: Float[Array, "slots 3 vertices"]
+    """A^-1 gradient: minus the plain step."""
+    gain: Float[Array, "slots"]
+    """<gradient, z>: twice the expected gain of a plain step."""
+    iteration: Int[Array, "slots"]
+    """Number of evaluations so far."""
+    history: Float[Array, "slots history"]
     memory: _Memory
-    stalled: Bool[Array, "w"]
+    stalled: Bool[Array, "slots"]
+    """True where two steps in a row were refused."""
 
 
 def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
@@ -160,7 +163,7 @@ def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
     member = jnp.arange(slots, dtype=jnp.int32)
 
     def finish_some(state):
-        """Iterate until a member is done; put it away and take the next ones."""
+        """Iterate until a member is done; store its result and start the next one."""
         tick, member, following, work, out = state
         own = jax.tree.map(lambda x: jnp.moveaxis(x.at[member].get(mode="clip"), 0, -1), inputs)
         advance = partial(_advance, evaluate, system, own, settings)
@@ -175,7 +178,7 @@ def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
         place = jnp.where(done, member, count)
         out = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), out, found)
         member = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, member)
-        # A slot for which no member is left stays at its solution, where a step costs the least.
+        # A slot without a next member stays at its solution, where a step costs the least.
         work = _restart(work, done & (member < count), start.at[member].get(mode="clip"))
         return tick, member, following + jnp.sum(done, dtype=jnp.int32), work, out
 
@@ -183,7 +186,7 @@ def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
     return jax.lax.while_loop(lambda s: jnp.any(s[1] < count), finish_some, begin)[-1]
 
 
-def _empty(p: Float[Array, "w 3 vertices"], settings: Settings) -> _Slots:
+def _empty(p: Float[Array, "slots 3 vertices"], settings: Settings) -> _Slots:
     w, m, dtype = p.shape[0], settings.history_length, p.dtype
     zeros = lambda *shape: jnp.zeros((w, *shape), dtype)  # noqa: E731
     shape, small = p.shape[1:], (m, m)
@@ -196,8 +199,10 @@ def _empty(p: Float[Array, "w 3 vertices"], settings: Settings) -> _Slots:
     return _Slots(p, at, zeros(*shape), zeros(), iteration, history, memory, jnp.zeros(w, bool))
 
 
-def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 vertices"]) -> _Slots:
-    """Put some slots before their first evaluation: a step of zero, from infinite energy."""
+def _restart(
+    work: _Slots, which: Bool[Array, "slots"], p: Float[Array, "slots 3 vertices"]
+) -> _Slots:
+    """Reset some slots to the state before their first evaluation: zero step, infinite energy."""
     wide = which[:, None, None]
     return work._replace(
         p=jnp.where(wide, p, work.p),
@@ -209,19 +214,19 @@ def _restart(work: _Slots, which: Bool[Array, "w"], p: Float[Array, "w 3 vertice
     )
 
 
-def _converged(work: _Slots, settings: Settings) -> Bool[Array, "w"]:
+def _converged(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
     return has_converged(work.gain, work.at.energy, work.at.rounding, settings.tolerance)
 
 
-def _done(work: _Slots, settings: Settings) -> Bool[Array, "w"]:
+def _done(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
     running = (work.iteration <= settings.max_steps) & ~work.stalled & ~_converged(work, settings)
     return (work.iteration > 0) & ~(running & jnp.isfinite(work.at.energy))
 
 
 def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
     step = _direction(work.memory, work.z, tick)
-    # The first iteration evaluates the start: its step is zero, its old energy infinite. (So the
-    # local step is compiled once.) A member that is done waits.
+    # The first iteration evaluates the start: its step is zero and its old energy infinite. (The
+    # local step is thus compiled only once.) A member that is done waits.
     step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
     p = work.p + step
     new = without_fusion(
@@ -231,13 +236,13 @@ def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
     g = right[:, 1]
     z = system.factor.solve(g)
     dz = z - work.z
-    # All inner products of an iteration that are not with the memory, as one batched product.
+    # All inner products of the iteration except those with the memory, as one batched product.
     left = jnp.stack([step, dz, z], axis=1)
     products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
     first = work.iteration == 0
     good = (new.energy <= work.at.energy + work.at.rounding) | first
-    # A refused step costs its evaluation and the memory; the plain step that follows cannot raise
-    # the energy, so a second refusal in a row is rounding.
+    # A refused step costs its evaluation and clears the memory. The plain step that follows cannot
+    # raise the energy, so a second refusal in a row is due to rounding.
     stalled = work.stalled | (~good & ~jnp.any(work.memory.filled, axis=1))
     memory = _remember(work.memory, tick, good & ~first, good, step, dz, g, products)
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
@@ -250,10 +255,12 @@ def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
     return tick + 1, _Slots(p, at, z, gain, work.iteration + 1, history, memory, stalled)
 
 
-def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 vertices"]:
-    """The two-loop recursion (Nocedal 1980) on the coefficients of s and z.
+def _direction(memory: _Memory, z, tick) -> Float[Array, "slots 3 vertices"]:
+    """Return the L-BFGS step by the two-loop recursion, on the coefficients of s and z.
 
-    From the newest step to the oldest and back: two triangular systems with the matrix s_i . y_j.
+    The loops, from the newest step to the oldest and back, are two triangular systems with the
+    matrix s_i . y_j. Nocedal, "Updating quasi-Newton matrices with limited storage" (1980),
+    doi:10.1090/S0025-5718-1980-0572855-7.
     """
     m = memory.filled.shape[1]
     both = memory.filled[:, :, None] & memory.filled[:, None]
@@ -266,7 +273,7 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 vertices"]:
     gamma = diagonal * alpha[..., 0] + bent - memory.zg
     gamma = jnp.where(memory.filled, gamma, 0.0)[..., None]
     gamma = solve(upper, gamma, left_side=True, transpose_a=True)
-    # From the order of age to that of the ring, whose oldest slot is the one to fill now.
+    # Go from the order of age to that of the ring buffer, where the oldest entry is filled next.
     place = (jnp.arange(m, dtype=tick.dtype) - tick) % m
     alpha, gamma = alpha[:, place, 0], gamma[:, place, 0]
     back = jnp.einsum("wm,wmak->wak", alpha, memory.z, precision="highest")
@@ -274,21 +281,21 @@ def _direction(memory: _Memory, z, tick) -> Float[Array, "w 3 vertices"]:
 
 
 def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
-    """Put new steps into the oldest slot, if the curvature along them is positive.
+    """Overwrite the oldest step with the new one if the curvature along it is positive.
 
-    A slot whose step was not good forgets all.
+    A slot whose step was refused forgets all steps.
     """
     m = memory.filled.shape[1]
     age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
     sy, yzy = products[:, 0, 0], products[:, 1, 0]
     sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
     zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
-    # NaN fails both comparisons, so nothing that is not finite ever comes in.
+    # NaN fails the comparison, so nothing that is not finite enters the memory.
     kept = after_reads(new & (sy > 1e-10 * yzy), yzy + jnp.sum(sg + zg, axis=1))
     column, square = sg - memory.sg, zg - memory.zg
 
     def later(matrix, row, column, corner):
-        """Drop the oldest, append the newest."""
+        """Drop the oldest row and column, and append the newest."""
         top = jnp.concatenate([matrix[:, 1:, 1:], column[:, 1:, None]], axis=2)
         bottom = jnp.concatenate([row[:, 1:], corner[:, None]], axis=1)
         return jnp.concatenate([top, bottom[:, None]], axis=1)

@@ -1,12 +1,14 @@
 """A Cholesky factor that stays on the device: nested dissection and a partitioned inverse.
 
-The mesh is cut in two, each part again, and so on (George 1973). The vertices along a cut, its
-separator, are eliminated after the two parts that they part, so all parts of a level can be worked
-on together. What a triangular solve would do one unknown after another is done by products with
-stored inverses instead (Alvarado, Pothen and Schreiber 1993): per level a gather and a batched
-product on the way up the tree, the same on the way down. No scatter, no host.
+The mesh is cut into two subdomains, each of these again, and so on (George, "Nested dissection of a
+regular finite element mesh", 1973, doi:10.1137/0710032). The vertices along a cut form a separator.
+Separator vertices are eliminated after both subdomains they separate, so all subdomains of a level
+are independent. A triangular solve would take one unknown after another. Products with stored
+inverses take its place (Alvarado, Pothen and Schreiber, "Highly parallel sparse triangular
+solution", 1993): for each level, a gather and a batched product on the way up the tree, and the
+same on the way down. There is no scatter, and the host is not called.
 
-Made for accelerators. On two cores it takes up to 2.5 times as long as CHOLMOD
+This factor is made for accelerators. On two cores it takes up to 2.5 times as long as CHOLMOD
 (docs/benchmarks.md).
 """
 
@@ -19,62 +21,67 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
-# Vertices in a part that is not cut any further. Fewer would mean more levels, each of which costs
-# a few launches; more would mean more to store (50,298 vertices: 32 stores 5.8 million numbers, 64
-# 7.3, 128 10.0).
+from jaxdeform._linalg.elimination_tree import Border, Tree, bisect, separators
+
+# A subdomain of this many vertices is not cut further. Smaller leaves give more levels, each of
+# which costs a few kernel launches; larger leaves take more memory. For 50,298 vertices, leaves of
+# 32, 64 and 128 store 5.8, 7.3 and 10.0 million numbers.
 LEAF = 64
 
 
 class Level(eqx.Module):
-    """All fronts of one depth of the tree, padded to one size.
+    """All fronts of one level of the tree, padded to one size.
 
-    A front is a part's own unknowns, s of them, and its border, r of them: the unknowns of
-    separators above that it touches.
+    A front belongs to a node. It consists of the node's own unknowns, which it eliminates, and of
+    its border: the unknowns of separators above that these touch.
     """
 
-    own: Int[Array, "parts s"]
-    """Vertices; n at fixed ones and where there are fewer."""
-    inverse: Float[Array, "parts s s"]
-    """F_ss^-1: the inverse of what is left of A at the part's own unknowns."""
-    coupling: Float[Array, "parts r s"]
-    """F_rs F_ss^-1."""
-    above: Int[Array, "parts r"]
-    """Where the border stands in the front of the part above; its size where there is none."""
-    below: Int[Array, "parts 2 front"]
-    """Where the front's entries stand in the borders of the two parts below, or their size."""
+    own: Int[Array, "nodes own"]
+    """The own unknowns; the number of all unknowns at fixed ones and at padding."""
+    inverse: Float[Array, "nodes own own"]
+    """F_ss^-1: the inverse of what is left of A at the own unknowns (s)."""
+    coupling: Float[Array, "nodes border own"]
+    """F_rs F_ss^-1, where r are the unknowns of the border."""
+    above: Int[Array, "nodes border"]
+    """Where the border stands in the front of the parent; the size of that front at padding."""
+    below: Int[Array, "nodes 2 front"]
+    """Where the front stands in the borders of the two children; their size where it does not."""
 
-    def from_below(self, pushed: Float[Array, "below r c"]) -> Float[Array, "parts front c"]:
-        """Return what the borders of the parts below push into the fronts."""
+    def from_below(
+        self, pushed: Float[Array, "children border columns"]
+    ) -> Float[Array, "nodes front columns"]:
+        """Return what the borders of the children push into the fronts."""
         pushed = _with_zero(pushed, axis=1)
         pushed = pushed.reshape(pushed.shape[0] // 2, 2, *pushed.shape[1:])
         return jnp.sum(jnp.take_along_axis(pushed, self.below[..., None], axis=2), axis=1)
 
-    def from_above(self, front: Float[Array, "above front c"]) -> Float[Array, "parts r c"]:
-        """Return the border's part of the solution in the fronts above."""
-        parts, r = self.above.shape
-        above = self.above.reshape(parts // 2, 2 * r, 1)
+    def from_above(
+        self, front: Float[Array, "parents front columns"]
+    ) -> Float[Array, "nodes border columns"]:
+        """Return the solution at the borders, taken from the fronts of the parents."""
+        nodes, r = self.above.shape
+        above = self.above.reshape(nodes // 2, 2 * r, 1)
         border = jnp.take_along_axis(_with_zero(front, axis=1), above, axis=1)
-        return border.reshape(parts, r, front.shape[2])
+        return border.reshape(nodes, r, front.shape[2])
 
 
 class DissectedFactor(eqx.Module):
-    """The inverse of the free part of a symmetric positive definite matrix, in products."""
+    """The inverse of the free-free block of a symmetric positive definite matrix, as products."""
 
     levels: tuple[Level, ...]
     """From the leaves to the root."""
-    place: Int[Array, "n"]
-    """Where each vertex stands in the own unknowns of all levels."""
+    place: Int[Array, "unknowns"]
+    """Where each unknown stands in the own unknowns of all levels."""
 
-    def solve(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed vertices."""
-        # custom_linear_solve gives the derivatives: a symmetric solve is its own adjoint. (Those
-        # of the gathers would be scatters.)
+    def solve(self, right: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
+        """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed unknowns."""
+        # custom_linear_solve supplies the derivatives: a symmetric solve is its own adjoint. (The
+        # derivatives of the gathers would be scatters.)
         apply = lambda _, b: self._apply(b)  # noqa: E731
         return jax.lax.custom_linear_solve(lambda x: x, right, apply, symmetric=True)
 
-    def _apply(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def _apply(self, right: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
         *lead, n = right.shape
         columns = _with_zero(right.reshape(math.prod(lead), n).T, axis=0)
         unmoved, pushed = [], None
@@ -99,203 +106,169 @@ class DissectedFactor(eqx.Module):
 
 
 def _product(indices: str, a: Array, b: Array) -> Array:
-    # A GPU would by default round float32 to TF32, three digits, before it multiplies.
+    # By default a GPU would round float32 to TF32, three digits, before multiplying.
     return jnp.einsum(indices, a, b, precision="highest")
 
 
 def _with_zero(x: Array, axis: int) -> Array:
-    """Append one zero, which padding refers to."""
+    """Append the zero that padding refers to."""
     return jnp.pad(x, [(0, int(k == axis)) for k in range(x.ndim)])
 
 
 def dissected_factor(
     matrix: sp.spmatrix,
-    free: Bool[np.ndarray, "n"],
-    positions: Float[np.ndarray, "n 3"],
+    free: Bool[np.ndarray, "unknowns"],
+    positions: Float[np.ndarray, "unknowns 3"],
     dtype: np.dtype,
 ) -> DissectedFactor:
-    """Factor the free part of a symmetric positive definite matrix over vertices at positions.
+    """Factor the free-free block of a symmetric positive definite matrix over points in space.
 
-    The tree and all shapes depend on the pattern of the matrix and the positions alone: fixed
-    unknowns stay in it, as rows of the identity, so another handle set compiles nothing.
+    The tree and all array shapes depend only on the pattern of the matrix and on the positions.
+    Fixed unknowns stay in the tree, as rows of the identity, so another handle set recompiles
+    nothing.
 
-    **Raises** numpy.linalg.LinAlgError where it is not positive definite.
+    **Raises** numpy.linalg.LinAlgError if the block is not positive definite.
     """
     n = matrix.shape[0]
     depth = int(np.ceil(np.log2(max(1.0, n / LEAF))))
-    entries = sp.coo_matrix(matrix)
-    i, j = entries.row.astype(np.int64), entries.col.astype(np.int64)
-    level, part = _separators(i, j, _bisect(positions, depth), depth)
-    # Each front takes in the rows of its own unknowns; columns eliminated before are done with.
-    later = level[j] <= level[i]
+    stored = sp.coo_matrix(matrix)
+    i, j = stored.row.astype(np.int64), stored.col.astype(np.int64)
+    tree = Tree.of(*separators(i, j, bisect(positions, depth), depth), depth)
+    # A front takes the rows of its own unknowns. Columns eliminated before it are done.
+    later = tree.level[j] <= tree.level[i]
     i, j = i[later], j[later]
-    data = np.where(free[i] & free[j], entries.data[later], 0.0)
+    entries = _Entries(i, j, np.where(free[i] & free[j], stored.data[later], 0.0))
 
-    levels, place, slot, count = [], np.zeros(n, np.int32), np.zeros(n, np.int64), 0
-    border, pushed = _Border.of(i[:0], i[:0], 2 << depth, n), np.zeros((2 << depth, 0, 0))
+    levels = []
+    below, pushed = Border.of(i[:0], i[:0], 2 << depth, n), np.zeros((2 << depth, 0, 0))
     for k in range(depth, -1, -1):
-        parts, below = 1 << k, border
-        mine = np.flatnonzero(level == k)
-        slot[mine], s = _ranks(part[mine], parts)
-        own = np.full((parts, s), n, np.int32)
-        own[part[mine], slot[mine]] = mine
-        place[mine] = count + part[mine] * s + slot[mine]
-        count += own.size
-        rows = np.flatnonzero(level[i] == k)
-        rises, stays = rows[level[j[rows]] < k], level[below.vertex] < k
-        border = _Border.of(
-            np.concatenate([part[i[rises]], below.part[stays] // 2]),
-            np.concatenate([j[rises], below.vertex[stays]]),
-            parts,
-            n,
-        )
-        size = s + border.width
+        mine = entries.select(tree.level[i] == k)
+        fronts = _Fronts(tree, k, _border(tree, k, mine, below))
+        own, front = fronts.assemble(mine, free)
+        above = fronts.places_of(below)
+        _add_pushed(front, above, pushed)
+        inverse, coupling, pushed = _eliminate(front[:, : fronts.size, : fronts.size], own.shape[1])
+        levels.append(_Eliminated(own, inverse, coupling, above, fronts.inverse_places(above)))
+        below = fronts.border
+    return _as_factor(levels, tree.place(depth), dtype)
 
-        def stand(where, vertex, k=k, s=s, border=border):
-            """Return where vertices stand in the fronts of some parts."""
-            return np.where(level[vertex] == k, slot[vertex], s + border.find(where, vertex))
 
-        # One row and column more than a front has take what pads the borders below.
-        front = np.zeros((parts, size + 1, size + 1))
-        here, row, column = part[i[rows]], slot[i[rows]], stand(part[i[rows]], j[rows])
-        front[here, row, column] = data[rows]
-        front[here, column, row] = data[rows]
+class _Entries(NamedTuple):
+    """Entries of the matrix; the front that eliminates row i takes them."""
+
+    i: Int[np.ndarray, "entries"]
+    j: Int[np.ndarray, "entries"]
+    value: Float[np.ndarray, "entries"]
+
+    def select(self, chosen: Bool[np.ndarray, "entries"]) -> "_Entries":
+        return _Entries(self.i[chosen], self.j[chosen], self.value[chosen])
+
+
+class _Fronts(NamedTuple):
+    """The fronts of level k, before their elimination."""
+
+    tree: Tree
+    k: int
+    border: Border
+
+    @property
+    def own_width(self) -> int:
+        return int(self.tree.width[self.k])
+
+    @property
+    def size(self) -> int:
+        return self.own_width + self.border.width
+
+    def find(self, node, vertex):
+        """Return where vertices stand in the fronts of some nodes."""
+        in_border = self.own_width + self.border.find(node, vertex)
+        return np.where(self.tree.level[vertex] == self.k, self.tree.slot[vertex], in_border)
+
+    def assemble(self, mine: _Entries, free) -> tuple[np.ndarray, np.ndarray]:
+        """Return the own unknowns of each front, and the fronts with the entries of the matrix.
+
+        One row and column beyond the size of a front take what pads the borders below.
+        """
+        tree, nodes, n = self.tree, 1 << self.k, len(free)
+        vertex = np.flatnonzero(tree.level == self.k)
+        own = np.full((nodes, self.own_width), n, np.int32)
+        own[tree.node[vertex], tree.slot[vertex]] = vertex
+        front = np.zeros((nodes, self.size + 1, self.size + 1))
+        here, row = tree.node[mine.i], tree.slot[mine.i]
+        column = self.find(here, mine.j)
+        front[here, row, column] = mine.value
+        front[here, column, row] = mine.value
         own[~np.append(free, False)[own]] = n
         lone, at = np.nonzero(own == n)
         front[lone, at, at] = 1.0
-        above = np.full((2 * parts, below.width), size, np.int32)
-        above[below.part, below.slot] = stand(below.part // 2, below.vertex)
-        for side in (0, 1):
-            to = above[side::2]
-            front[np.arange(parts)[:, None, None], to[:, :, None], to[:, None]] += pushed[side::2]
-        found = np.full((2 * parts, size + 1), below.width, np.int32)
-        found[np.arange(2 * parts)[:, None], above] = np.arange(below.width, dtype=np.int32)
+        return own, front
 
-        half = np.linalg.inv(np.linalg.cholesky(front[:, :s, :s]))
-        inverse = np.swapaxes(half, 1, 2) @ half
-        outside = front[:, s:size, :s]
-        coupling = outside @ inverse
-        pushed = front[:, s:size, s:size] - coupling @ np.swapaxes(outside, 1, 2)
-        levels.append((own, inverse, coupling, above, found[:, :size].reshape(parts, 2, size)))
-    # What a level knows of the next one up was found there.
-    above = [level[3] for level in levels[1:]] + [np.zeros((1, 0), np.int32)]
-    return DissectedFactor(
-        tuple(
-            Level(
-                own=jnp.asarray(own),
-                inverse=jnp.asarray(inverse, dtype),
-                coupling=jnp.asarray(coupling, dtype),
-                above=jnp.asarray(up),
-                below=jnp.asarray(down),
-            )
-            for (own, inverse, coupling, _, down), up in zip(levels, above, strict=True)
-        ),
-        jnp.asarray(place),
+    def places_of(self, below: Border) -> Int[np.ndarray, "children border"]:
+        """Return where the borders of the children stand in these fronts; padding gets the size."""
+        above = np.full((2 << self.k, below.width), self.size, np.int32)
+        above[below.node, below.slot] = self.find(below.node // 2, below.vertex)
+        return above
+
+    def inverse_places(self, above) -> Int[np.ndarray, "nodes 2 front"]:
+        """Return where the entries of these fronts stand in the borders of the two children."""
+        children, width = above.shape
+        found = np.full((children, self.size + 1), width, np.int32)
+        found[np.arange(children)[:, None], above] = np.arange(width, dtype=np.int32)
+        return found[:, : self.size].reshape(children // 2, 2, self.size)
+
+
+class _Eliminated(NamedTuple):
+    """A level of the factor on the host. Here ``above`` is the place of the children's borders."""
+
+    own: np.ndarray
+    inverse: np.ndarray
+    coupling: np.ndarray
+    above: np.ndarray
+    below: np.ndarray
+
+
+def _border(tree: Tree, k: int, mine: _Entries, below: Border) -> Border:
+    """Return the borders of level k: unknowns above that its entries or its children touch."""
+    rises, stays = tree.level[mine.j] < k, tree.level[below.vertex] < k
+    return Border.of(
+        np.concatenate([tree.node[mine.i[rises]], below.node[stays] // 2]),
+        np.concatenate([mine.j[rises], below.vertex[stays]]),
+        1 << k,
+        len(tree.level),
     )
 
 
-def _bisect(positions: Float[np.ndarray, "n 3"], depth: int) -> Int[np.ndarray, "n"]:
-    """Cut into 2^depth equal parts: each level in two, across the direction of largest spread.
-
-    The bits of a label tell the sides, the first cut's in front. Against METIS's partition of the
-    graph (recursive bisection) this stores 0.8 to 1.5 times as much, and needs no other library.
-    """
-    n = len(positions)
-    label, order = np.zeros(n, np.int64), np.arange(n)
-    # The squares below shall not overflow.
-    positions = positions - positions.mean(axis=0)
-    positions = positions / max(np.abs(positions).max(initial=0.0), np.finfo(float).tiny)
-    for k in range(depth):
-        sorted_label = label[order]
-        first = np.searchsorted(sorted_label, np.arange(1 << k))
-        count = np.diff(np.append(first, n))
-        x = positions[order]
-        x = x - (np.add.reduceat(x, first) / count[:, None])[sorted_label]
-        spread = np.add.reduceat(x[:, :, None] * x[:, None], first)
-        axis = np.linalg.eigh(spread)[1][:, :, -1]
-        along = np.einsum("ni,ni->n", x, axis[sorted_label])
-        order = order[np.lexsort((along, sorted_label))]
-        second = np.arange(n) - first[sorted_label] >= (count // 2)[sorted_label]
-        label[order] = 2 * sorted_label + second
-    return label
+def _add_pushed(front: np.ndarray, above: np.ndarray, pushed: np.ndarray) -> None:
+    """Add what the two children of each front push into it, one child at a time."""
+    node = np.arange(len(front))[:, None, None]
+    for side in (0, 1):
+        to = above[side::2]
+        front[node, to[:, :, None], to[:, None]] += pushed[side::2]
 
 
-def _separators(
-    i: Int[np.ndarray, "entries"], j: Int[np.ndarray, "entries"], label, depth: int
-) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Return for each unknown the level and the part that eliminates it.
-
-    An edge that a cut goes through must have an end in the separator: the fewest such unknowns are
-    a vertex cover.
-    """
-    level = np.full(len(label), depth)
-    once = i < j
-    i, j = i[once], j[once]
-    for k in range(depth):
-        left = (level[i] == depth) & (level[j] == depth)
-        i, j = i[left], j[left]
-        side_i, side_j = label[i] >> (depth - 1 - k), label[j] >> (depth - 1 - k)
-        cut = (side_i != side_j) & (side_i >> 1 == side_j >> 1)
-        swap = side_i[cut] > side_j[cut]
-        one, two = np.where(swap, j[cut], i[cut]), np.where(swap, i[cut], j[cut])
-        level[_vertex_cover(one, two)] = k
-    return level, label >> (depth - level)
+def _eliminate(front: np.ndarray, s: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Eliminate the first s unknowns: return F_ss^-1, F_rs F_ss^-1 and the Schur complement."""
+    half = np.linalg.inv(np.linalg.cholesky(front[:, :s, :s]))
+    inverse = np.swapaxes(half, 1, 2) @ half
+    outside = front[:, s:, :s]
+    coupling = outside @ inverse
+    return inverse, coupling, front[:, s:, s:] - coupling @ np.swapaxes(outside, 1, 2)
 
 
-def _vertex_cover(one: Int[np.ndarray, "e"], two: Int[np.ndarray, "e"]) -> Int[np.ndarray, "c"]:
-    """Return the fewest vertices that meet all edges of a bipartite graph (Koenig 1931).
-
-    From the unmatched on the first side, along paths that alternate with the matching: the cover is
-    what they do not reach there, and what they reach on the second side.
-    """
-    first, a = np.unique(one, return_inverse=True)
-    second, b = np.unique(two, return_inverse=True)
-    graph = sp.csr_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(first), len(second)))
-    partner = maximum_bipartite_matching(graph, perm_type="column")
-    matched = np.flatnonzero(partner >= 0)
-    back = np.full(len(second), -1)
-    back[partner[matched]] = matched
-    reached, beyond = partner < 0, np.zeros(len(second), bool)
-    new = reached.copy()
-    while new.any():
-        step = np.unique(b[new[a] & ~beyond[b]])
-        beyond[step] = True
-        new = np.zeros(len(first), bool)
-        new[back[step]] = True  # all are matched, or the matching could grow
-        new &= ~reached
-        reached |= new
-    return np.concatenate([first[~reached], second[beyond]])
-
-
-class _Border(NamedTuple):
-    """The borders of all parts of a level: for each entry its part, vertex and slot."""
-
-    part: Int[np.ndarray, "entries"]
-    vertex: Int[np.ndarray, "entries"]
-    slot: Int[np.ndarray, "entries"]
-    width: int
-    key: Int[np.ndarray, "entries"]
-    n: int
-
-    @staticmethod
-    def of(part, vertex, parts: int, n: int) -> "_Border":
-        """Collect pairs of part and vertex, each once."""
-        key = np.unique(part * n + vertex)
-        part, vertex = np.divmod(key, n)
-        return _Border(part, vertex, *_ranks(part, parts), key, n)
-
-    def find(self, part, vertex):
-        """Return the slots of vertices in the borders of parts; anything where there is none."""
-        if not len(self.key):
-            return np.zeros(len(part), np.int64)
-        at = np.searchsorted(self.key, part * self.n + vertex)
-        return self.slot[np.minimum(at, len(self.key) - 1)]
-
-
-def _ranks(group: Int[np.ndarray, "m"], groups: int) -> tuple[Int[np.ndarray, "m"], int]:
-    """Number the members of each group from 0; return also the size of the largest group."""
-    size = np.bincount(group, minlength=groups)
-    order = np.argsort(group, kind="stable")
-    rank = np.empty(len(group), np.int64)
-    rank[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
-    return rank, int(size.max(initial=0))
+def _as_factor(levels: list[_Eliminated], place: np.ndarray, dtype: np.dtype) -> DissectedFactor:
+    """Move a factor to the device."""
+    # The place of a level's border in its parent was found with the parent.
+    above = [level.above for level in levels[1:]] + [np.zeros((1, 0), np.int32)]
+    return DissectedFactor(
+        tuple(
+            Level(
+                own=jnp.asarray(level.own),
+                inverse=jnp.asarray(level.inverse, dtype),
+                coupling=jnp.asarray(level.coupling, dtype),
+                above=jnp.asarray(up),
+                below=jnp.asarray(level.below),
+            )
+            for level, up in zip(levels, above, strict=True)
+        ),
+        jnp.asarray(place),
+    )

@@ -25,16 +25,17 @@ from jaxdeform._linalg.subset import SMALL, on_few
 def polar_rotation(c: Matrices) -> Matrices:
     """Return the proper rotations R (det +1) that maximise tr(R C), cell by cell.
 
-    ``C = U S V^T`` gives ``R = V U^T``; where C is singular or its own reflection is closer, the
-    direction of the least singular value takes the sign. In closed form but for a quartic (FOAM,
-    Markley 1993), which keeps full precision on flat cells too, with the SVD where R is (nearly)
-    not unique: 2.5 ms for 51,200 cells, where a Jacobi SVD by components takes 10, LAPACK's 130.
+    If ``C = U S V^T``, then ``R = V U^T``. If that is a reflection, the direction of the smallest
+    singular value changes sign. The rotation comes in closed form from the root of a quartic (FOAM,
+    Markley, "Attitude determination using vector observations: a fast optimal matrix algorithm",
+    1993), which keeps full precision on flat cells too. Where R is not unique, or nearly so, the
+    SVD is used. 51,200 cells take 2.5 ms; a Jacobi SVD by components takes 10 ms, LAPACK's 130 ms.
     """
     return from_grid(polar_rotation_of_grid(as_grid(c)))
 
 
 def polar_rotation_of_grid(c: Grid) -> Grid:
-    # Scaled to the order of 1, since the products square and cube the entries.
+    # Scale the entries to the order of 1, because the products square and cube them.
     size = reduce(jnp.maximum, [jnp.abs(v) for row in c for v in row])
     scale = jnp.where(size > 0, size, 1.0)
     c = [[v / scale for v in row] for row in c]
@@ -43,12 +44,13 @@ def polar_rotation_of_grid(c: Grid) -> Grid:
     return on_few(_svd_rotation, ~certain, n if n <= SMALL else n // 64, rotation, c)
 
 
-def _markley(c: Grid) -> tuple[Grid, Bool[Array, "n"]]:
-    """Return the rotations, and where they are exact.
+def _markley(c: Grid) -> tuple[Grid, Bool[Array, "cells"]]:
+    """Return the rotations, and for which cells they are exact.
 
-    The largest root of ``(x^2 - |C|^2)^2 - 4 |cof C|^2 - 8 x det C`` is x = s1 + s2 + s3, the last
-    with the sign of det C. Newton comes down to it from a bound above. The error of R is that of
-    the root over ``zeta = (s1 + s2) (s2 + s3) (s3 + s1)``: 1e-15 to 1e-11 where zeta > 1e-4 x^3.
+    The largest root of ``(x^2 - |C|^2)^2 - 4 |cof C|^2 - 8 x det C`` is x = s1 + s2 + s3, the sum
+    of the singular values, where s3 takes the sign of det C. Newton's method descends to it from an
+    upper bound. The error of R is the error of the root divided by
+    ``zeta = (s1 + s2) (s2 + s3) (s3 + s1)``: 1e-15 to 1e-11 where zeta > 1e-4 x^3.
     """
     a = transpose(c)
     eps = jnp.finfo(a[0][0].dtype).eps
@@ -65,8 +67,8 @@ def _markley(c: Grid) -> tuple[Grid, Bool[Array, "n"]]:
         return x - move, jnp.abs(move)
 
     bound = jnp.sqrt(square + 2.0 * jnp.sqrt(3.0 * area))
-    # Three steps in one pass over the cells. (As a loop, or the compiler would repeat them in each
-    # of the nine entries that follow.)
+    # Take three steps in one pass over the cells. Without the loop, the compiler would repeat them
+    # for each of the nine entries that follow.
     thrice = lambda _, state: reduce(lambda s, k: newton(k, s), range(3), state)  # noqa: E731
     x, move = jax.lax.fori_loop(0, 2, thrice, (bound, bound))
     kappa = 0.5 * (x * x - square)
@@ -79,13 +81,13 @@ def _markley(c: Grid) -> tuple[Grid, Bool[Array, "n"]]:
         for i in range(3)
     ]
     certain = (zeta > (1e-4 + 1e5 * eps) * x**3) & (move <= jnp.sqrt(eps) * x)
-    # A cell that is a point (an unreferenced vertex) stays as it is.
+    # A cell without extent (an unreferenced vertex) does not rotate.
     point = square == 0
     return where(point, identity(x), rotation), certain | point
 
 
 def _svd_rotation(rotation: Grid, c: Grid) -> Grid:
-    """Return the rotations by LAPACK's SVD, which settles the cells with several best ones."""
+    """Return the rotations by LAPACK's SVD, which decides where several are equally good."""
     del rotation
     u, _, vt = jnp.linalg.svd(jnp.moveaxis(from_grid(c), -1, 0))
     sign = jnp.sign(jnp.linalg.det(u) * jnp.linalg.det(vt))
@@ -105,7 +107,7 @@ def rotation_with_derivative(rotation: Matrices, c: Matrices) -> Matrices:
 def _rotation_jvp(primals, tangents):
     """``dR = R [w]x`` with ``(tr(M) I - M) w = axial(N - N^T)``, M = C R, N = R^T dC^T."""
     rotation, c = primals
-    rotation = rotation_with_derivative(rotation, c)  # so that this rule has derivatives too
+    rotation = rotation_with_derivative(rotation, c)  # so that the rule itself has derivatives
     dc = tangents[1]
     r, rt = as_grid(rotation), transpose(as_grid(rotation))
     m = product(as_grid(c), r)
@@ -118,20 +120,20 @@ def _rotation_jvp(primals, tangents):
     cofactor = [cross(s[1], s[2]), cross(s[2], s[0]), cross(s[0], s[1])]
     det = inner(s[0], cofactor[0])
     floor = jnp.finfo(c.dtype).eps * jnp.abs(trace) ** 3 + jnp.finfo(c.dtype).tiny
-    det = jnp.where(jnp.abs(det) > floor, det, jnp.inf)  # no unique rotation: no derivative
+    det = jnp.where(jnp.abs(det) > floor, det, jnp.inf)  # no unique rotation: the derivative is 0
     w = [sum(cofactor[k][i] * axial[k] for k in range(3)) / det for i in range(3)]
     zero = jnp.zeros_like(trace)
     skew = [[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]]
     return rotation, from_grid(product(r, skew))
 
 
-def quaternions_from_matrices(turn: Float[Array, "m 3 3"]) -> Float[Array, "m 4"]:
-    """Return (w, x, y, z) of rotation matrices, in either sign.
+def quaternions_from_matrices(matrices: Float[Array, "rows 3 3"]) -> Float[Array, "rows 4"]:
+    """Return the quaternions (w, x, y, z) of rotation matrices, with either sign.
 
     ``4 q q^T`` is linear in the matrix. Its row with the largest diagonal entry is q times a
-    number that is at least 1, hence smooth to differentiate, the identity and 180 degrees included.
+    number of size 1 or more. It is therefore smooth everywhere, even at 0 and 180 degrees.
     """
-    (a, b, c), (d, e, f), (g, h, i) = jnp.moveaxis(turn, 0, -1)
+    (a, b, c), (d, e, f), (g, h, i) = jnp.moveaxis(matrices, 0, -1)
     outer = jnp.stack(
         [
             jnp.stack([1 + a + e + i, h - f, c - g, d - b], axis=1),
@@ -146,7 +148,7 @@ def quaternions_from_matrices(turn: Float[Array, "m 3 3"]) -> Float[Array, "m 4"
     return row / jnp.linalg.norm(row, axis=1, keepdims=True)
 
 
-def matrices_from_quaternions(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
+def matrices_from_quaternions(q: Float[Array, "rows 4"]) -> Float[Array, "rows 3 3"]:
     w, x, y, z = q.T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -156,7 +158,9 @@ def matrices_from_quaternions(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
     return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
 
 
-def quaternion_product(p: Float[Array, "n 4"], q: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
+def quaternion_product(
+    p: Float[Array, "rows 4"], q: Float[Array, "rows 4"]
+) -> Float[Array, "rows 4"]:
     (a, b, c, d), (w, x, y, z) = p.T, q.T
     return jnp.stack(
         [

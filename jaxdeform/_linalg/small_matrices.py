@@ -1,15 +1,15 @@
-"""3x3 and 9x9 algebra by components, over all cells at once."""
+"""Algebra of 3x3 and 9x9 matrices by components, over all cells at once."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Matrices = Float[Array, "3 3 n"]
-Vectors = Float[Array, "3 n"]
-Scalars = Float[Array, "n"]
-# One component of all cells at a time: plain Python lists of (n,) arrays, so that every product
-# below is one contiguous, vectorised pass, and small matrices cost no transposition.
+Matrices = Float[Array, "3 3 cells"]
+Vectors = Float[Array, "3 cells"]
+Scalars = Float[Array, "cells"]
+# A grid is a nested Python list of arrays (cells,), one per component. Every product below is then
+# one contiguous, vectorised pass, and transposing a matrix costs nothing.
 Grid = list[list[Array]]
 
 

@@ -1,21 +1,21 @@
-"""Running a function on the few entries that need it."""
+"""Run a function only on the few cells that need it."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-# Up to this many cells the slow ones are not worth code of their own.
+# Up to this many cells, gathering the few would cost more compile time than it saves.
 SMALL = 2000
 
 
-def on_few(solve, waiting: Bool[Array, "n"], size: int, x, *data):
-    """Replace x by ``solve(x, *data)`` in the cells that wait, ``size`` cells at a time.
+def on_few(solve, waiting: Bool[Array, "cells"], size: int, x, *data):
+    """Replace x by ``solve(x, *data)`` in the waiting cells, ``size`` cells at a time.
 
-    Usually they are none, and nothing is run. All arrays have the cells last.
+    Usually no cell waits, and nothing runs. In all arrays the cells are the last axis.
     """
     n = waiting.shape[0]
     if size >= n:
-        # A loop, since under vmap a cond would run for all lanes, always.
+        # A loop instead of a cond, because under vmap a cond always runs, for the whole batch.
         put = lambda old, new: jnp.where(waiting, new, old)  # noqa: E731
 
         def once(state):

@@ -1,4 +1,4 @@
-"""Cells: which edges move together with a vertex (thesis Sec. 2.3)."""
+"""Cells: the edges that deform together with a vertex (thesis Sec. 2.3)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,17 +14,18 @@ from jaxdeform.errors import ArrayLike, InputError
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """One cell per vertex: the edges whose deformation its transformation must explain.
+    """One cell per vertex: the edges that the transformation of this vertex has to fit.
 
-    Made by :func:`rings` and :func:`spokes`. Cells are a value, as the mesh is.
+    Made by :func:`rings` and :func:`spokes`. Like the mesh, cells are a value: equal content makes
+    them equal, in every process.
     """
 
     mesh: Mesh
     """The rest shape that the cells belong to."""
     weights: Float[np.ndarray, "edges"]
-    """One weight per row of ``mesh.edges``; cotangents unless the caller gave others."""
+    """One weight per row of ``mesh.edges``; cotangent weights by default."""
     membership: sp.csr_matrix
-    """(vertices, edges), 1 where the edge belongs to the vertex's cell."""
+    """(vertices, edges): 1 where the edge belongs to the cell of the vertex."""
 
     @property
     def edges(self) -> Int[np.ndarray, "edges 2"]:
@@ -33,18 +34,18 @@ class Cells:
 
     @property
     def n_vertices(self) -> int:
-        """Number of cells, which is the number of vertices."""
+        """Number of vertices, which is also the number of cells."""
         return self.mesh.n_vertices
 
     @cached_property
     def digest(self) -> bytes:
-        """Fingerprint of the content: equal for equal cells, in any process."""
+        """A fingerprint of the content: the same for equal cells, in every process."""
         member = self.membership
         mesh = np.frombuffer(self.mesh.digest, np.uint8)
         return content_digest(mesh, self.weights, member.indptr, member.indices, member.data)
 
     def __eq__(self, other: object) -> bool:
-        """Return whether the other cells have the same mesh, weights and members."""
+        """Return whether the other cells have the same mesh, weights and membership."""
         return self is other or (isinstance(other, Cells) and self.digest == other.digest)
 
     def __hash__(self) -> int:
@@ -53,12 +54,12 @@ class Cells:
 
     @property
     def overlap(self) -> Int[np.ndarray, "edges"]:
-        """d_e of Eq. 4.5: the number of cells that contain each edge."""
+        """The number of cells that contain each edge: d_e of Eq. 4.5."""
         return np.bincount(self.membership.indices, minlength=len(self.edges))
 
     @property
     def reach(self) -> sp.csr_matrix:
-        """(cells, vertices), nonzero where an edge of the cell ends, and at its centre."""
+        """(cells, vertices): nonzero at the ends of the edges of a cell and at its centre."""
         count, n = len(self.edges), self.n_vertices
         rows = np.repeat(np.arange(count), 2)
         ends = sp.csr_matrix((np.ones(2 * count, np.int32), (rows, self.edges.ravel())), (count, n))
@@ -68,48 +69,52 @@ class Cells:
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
         mean = self.membership.nnz / max(self.n_vertices, 1)
-        return f"Cells({self.n_vertices} cells, {len(self.edges)} edges, {mean:.1f} edges a cell)"
+        return f"Cells({self.n_vertices} cells, {len(self.edges)} edges, {mean:.1f} edges per cell)"
 
 
 def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> Cells:
     """Return the r-ring cells: ``E(k, r)`` holds the edges with both ends within r steps of k.
 
-    ``r = 1`` therefore has the rim edges too and is not the neighbourhood of ARAP; for that see
-    :func:`spokes`. Thesis Sec. 2.3; RC-ARAP (Chen et al. 2017).
+    A cell with ``r = 1`` includes the edges of its rim, so it is not the neighbourhood of ARAP; see
+    :func:`spokes` for that. Thesis Sec. 2.3, after Chen, Gao, Lai and Xia, "Rigidity controllable
+    as-rigid-as-possible shape deformation" (2017).
 
     **Arguments**
 
     - mesh: the rest shape.
     - r: an integer >= 1, or one per vertex, (vertices,).
-    - weights: one finite weight per row of ``mesh.edges``, used as they are. The default is
-      cotangent weights. Their negative ones (obtuse angles) are kept, except in cells whose moments
-      ``B_k = sum w e e^T`` they make indefinite. There they are set to 0, because such a cell would
-      gain energy from stretching. Few meshes have such cells.
+    - weights: (edges,), one finite weight per row of ``mesh.edges``, used as given. By default,
+      cotangent weights. Negative ones (obtuse angles) are kept, except where they make the moments
+      ``B_k = sum w e e^T`` of a cell indefinite: there they are set to 0, because stretching such a
+      cell would lower its energy. Few meshes have such cells.
 
-    **Raises** InputError: r below 1, not an integer, or of the wrong length; weights likewise.
+    **Returns** :class:`Cells`.
+
+    **Raises** InputError: r is below 1, not an integer, or of the wrong length; the weights are not
+    finite or of the wrong length.
 
     Example:
         >>> import jaxdeform as jd
         >>> jd.rings(jd.shapes.bar(), 2)
-        Cells(722 cells, 2160 edges, 41.8 edges a cell)
+        Cells(722 cells, 2160 edges, 41.8 edges per cell)
     """
     n = mesh.n_vertices
     radius = np.asarray(r)
     if radius.dtype.kind not in "iu":
-        raise InputError(f"r must be an integer or one per vertex, got {radius.dtype}: use 1 or 2")
+        raise InputError(f"r must be an integer, or one per vertex, got {radius.dtype}: try 1")
     if radius.ndim > 0 and radius.shape != (n,):
         raise InputError(
-            f"r has shape {radius.shape}, the mesh {n} vertices: give one integer, or ({n},)"
+            f"r has shape {radius.shape}, but the mesh has {n} vertices: give one integer or ({n},)"
         )
     radius = np.broadcast_to(radius, (n,))
     if radius.min() < 1:
         k = int(radius.argmin())
         raise InputError(
-            f"r = {radius[k]} at vertex {k}: a ring needs r >= 1 (spokes(mesh) for ARAP's cells)"
+            f"r = {radius[k]} at vertex {k}: give 1 or more, or use spokes(mesh) for ARAP"
         )
 
     incidence = _incidence(mesh)
-    # As booleans: counts of paths would overflow (256 of them are 0 in eight bits).
+    # Booleans, because counts of paths would overflow: in eight bits, 256 paths count as 0.
     ends_at = incidence.astype(bool)
     step = sp.csr_matrix(ends_at @ ends_at.T + sp.eye_array(n).astype(bool))
     reach = step
@@ -118,9 +123,9 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
         growing.eliminate_zeros()
         wider = sp.csr_matrix(reach + growing @ step)
         if wider.nnz == reach.nnz:
-            break  # every cell is all of its part already
+            break  # every cell already covers its connected component
         reach = wider
-    # Of an edge's two ends, a cell reaches none, one or both: both make it a member.
+    # A cell reaches none, one or both ends of an edge. The edge is a member if it reaches both.
     ends = sp.csr_matrix(reach.astype(np.int8) @ incidence)
     ends.data = (ends.data == 2).astype(np.int8)
     ends.eliminate_zeros()
@@ -134,14 +139,24 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
 def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
     """Return the cells of plain ARAP: the edges that meet at the vertex (Eq. 3.3).
 
-    **Arguments**: mesh; weights as in :func:`rings`, but cotangent weights are left as they are,
-    as in every ARAP program: rotations do not need B. With a material on an obtuse mesh, prefer
-    rings or pass weights without negative ones. **Raises** InputError as there.
+    Sorkine and Alexa, "As-rigid-as-possible surface modeling" (2007),
+    doi:10.2312/SGP/SGP07/109-116.
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - weights: (edges,), as in :func:`rings`, but negative cotangent weights are always kept, as in
+      other ARAP programs: rotations do not need B. For a material on an obtuse mesh, use rings, or
+      pass weights that are not negative.
+
+    **Returns** :class:`Cells`.
+
+    **Raises** InputError: the weights are not finite or of the wrong length.
 
     Example:
         >>> import jaxdeform as jd
         >>> jd.spokes(jd.shapes.bar())
-        Cells(722 cells, 2160 edges, 6.0 edges a cell)
+        Cells(722 cells, 2160 edges, 6.0 edges per cell)
     """
     return Cells(mesh, _weights(mesh, weights), _incidence(mesh))
 
@@ -149,16 +164,17 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
 def principal_moments(
     cells: Cells,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3 3"]]:
-    """Return the moments b (ascending) and the axes Q of ``B_k = sum_e w_e e e^T = Q diag(b) Q^T``.
+    """Return the principal moments b (ascending) and axes Q of each cell.
 
-    The columns of ``Q_k`` are the principal axes of cell k, a proper rotation.
+    ``B_k = sum_e w_e e e^T = Q_k diag(b_k) Q_k^T``, in units of length squared. The columns of Q_k
+    are the principal axes of cell k; Q_k is a proper rotation.
     """
     i, j = cells.edges.T
     edge = cells.mesh.vertices[i] - cells.mesh.vertices[j]
     outer = cells.weights[:, None, None] * edge[:, :, None] * edge[:, None, :]
     moments = (cells.membership.astype(np.float64) @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
     values, axes = np.linalg.eigh(moments)
-    # A reflection would turn the proper rotation of a cell into an improper one.
+    # If Q were a reflection, the proper rotation of a cell would become an improper one.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return values, axes
 
@@ -172,7 +188,7 @@ def indefinite_cells(cells: Cells) -> Int[np.ndarray, "bad"]:
 def _bounded(
     mesh: Mesh, membership: sp.csr_matrix, weights: Float[np.ndarray, "edges"]
 ) -> Float[np.ndarray, "edges"]:
-    """Set the negative weights in indefinite cells to 0; raising a weight harms no other cell."""
+    """Set negative weights in indefinite cells to 0. Raising a weight harms no other cell."""
     if (weights >= 0).all():
         return weights
     bad = indefinite_cells(Cells(mesh, weights, membership))
@@ -183,7 +199,7 @@ def _bounded(
 
 
 def _incidence(mesh: Mesh) -> sp.csr_matrix:
-    """Return (vertices, edges), 1 where the vertex is an end of the edge."""
+    """Return (vertices, edges): 1 where the vertex is an end of the edge."""
     count = len(mesh.edges)
     columns = np.repeat(np.arange(count, dtype=np.int32), 2)
     matrix = sp.csr_matrix(

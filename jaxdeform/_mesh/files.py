@@ -1,4 +1,4 @@
-"""Reading and writing mesh files; what is on disk is replaced whole or not at all."""
+"""Read and write mesh files. A file on disk is replaced as a whole or not at all."""
 
 import os
 import tempfile
@@ -16,13 +16,17 @@ from jaxdeform.errors import ArrayLike, InputError
 def load_mesh(path: str | os.PathLike) -> Mesh:
     """Read a mesh from an OBJ, OFF, PLY or STL file.
 
-    STL stores no shared vertices, so its exactly equal corners are merged. Polygons with more than
-    three corners are refused, because how to cut them is the modeller's choice. A file that holds
-    less than it announces is refused; an OBJ announces nothing, unless :func:`save_mesh` (or
-    MeshLab) wrote it.
+    STL stores no shared vertices, so corners that are exactly equal are merged. Polygons with more
+    than three corners are refused: how to cut them is the modeller's choice. A file that holds less
+    than it announces is refused. An OBJ announces nothing unless :func:`save_mesh` or MeshLab
+    wrote it.
+
+    **Arguments**: path, whose suffix names the format.
+
+    **Returns** the :class:`Mesh`, in the unit of the file.
 
     **Raises** InputError: the file is missing, empty, truncated, unreadable or of another kind, or
-    what it holds is no valid :class:`Mesh`.
+    its content is not a valid :class:`Mesh`.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -45,21 +49,20 @@ def save_mesh(
     vertices: ArrayLike | None = None,
     rigidity: ArrayLike | None = None,
 ) -> None:
-    """Write a mesh as OBJ, OFF, PLY or STL, by the suffix of the path.
+    """Write a mesh as OBJ, OFF, PLY or STL; the suffix of the path chooses.
 
-    The file is written beside its final place and then renamed, so that a file that was there is
-    either kept whole or replaced whole. OBJ, OFF and PLY (binary) keep every bit; STL keeps single
-    precision.
+    The file is written under a temporary name and then renamed, so an old file is either kept or
+    replaced as a whole. OBJ, OFF and PLY (binary) keep every bit; STL keeps single precision.
 
     **Arguments**
 
-    - path: where to.
+    - path: the file to write.
     - mesh: the mesh.
-    - vertices: (n, 3) positions to write instead of the rest positions: another pose of it.
-    - rigidity: a number or (n,), written as the vertex property ``rigidity`` (PLY only).
+    - vertices: (vertices, 3), the positions of a pose; by default the rest positions.
+    - rigidity: a number or (vertices,), written as the vertex property ``rigidity`` (PLY only).
 
-    **Raises** InputError: unknown suffix, a folder that cannot be written, wrong shapes, positions
-    that are not finite.
+    **Raises** InputError: the suffix is unknown; the folder cannot be written; a shape is wrong; a
+    position is not finite.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -73,14 +76,14 @@ def save_mesh(
     points = np.asarray(mesh.vertices if vertices is None else vertices, np.float64)
     if points.shape != mesh.vertices.shape:
         raise InputError(
-            f"vertices have shape {points.shape}, the mesh has {mesh.vertices.shape}: a pose needs "
-            "one position per vertex"
+            f"vertices have shape {points.shape}, but the mesh has {mesh.vertices.shape}: a pose "
+            "needs one position per vertex"
         )
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise InputError(
-            f"{path}: vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} such): not written, "
-            "since no program could read it"
+            f"{path}: vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} in total): not "
+            "written, because no program could read it; give finite positions"
         )
     if rigidity is not None:
         if suffix != ".ply":
@@ -96,10 +99,15 @@ def save_mesh(
     write_atomically(path, lambda name: Path(name).write_bytes(content))
 
 
-def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "n"]:
-    """Read the per-vertex rigidity of a PLY file that :func:`save_mesh` wrote.
+def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
+    """Read the rigidity per vertex from a PLY file that :func:`save_mesh` wrote.
 
-    **Raises** InputError: no PLY file, or one without the vertex property ``rigidity``.
+    **Arguments**: path of a ``.ply`` file.
+
+    **Returns** (vertices,) floats.
+
+    **Raises** InputError: the file is not a PLY file, cannot be read, or lacks the vertex property
+    ``rigidity``.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -115,20 +123,21 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "n"]:
     if "rigidity" not in columns:
         raise InputError(
             f"{path}: its vertices have no property 'rigidity' (only {', '.join(columns)}): write "
-            "it with jd.save_mesh(..., rigidity=...)"
+            "the file with jd.save_mesh(..., rigidity=...)"
         )
     return columns["rigidity"]
 
 
 def read_arrays(
     path: str | os.PathLike,
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Read vertices and faces as they stand in the file, valid or not.
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Read vertices and faces as the file gives them, valid or not.
 
-    Read here rather than by libigl, which crashes the process on a truncated OBJ, never returns
-    from an empty OFF and drops half lines in silence. 50,000 vertices take 0.2 s.
+    libigl is not used, because it crashes the process on a truncated OBJ, never returns from an
+    empty OFF, and silently drops incomplete lines. 50,000 vertices take 0.2 s.
 
-    **Raises** InputError: missing, empty, truncated or unreadable file, unknown suffix, polygons.
+    **Raises** InputError: the file is missing, empty, truncated or unreadable, its suffix is
+    unknown, or it holds polygons.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -159,9 +168,9 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def write_atomically(path: Path, write: Callable[[str], object]) -> None:
-    """Call ``write(name)`` on a temporary file beside path, then move it into place.
+    """Call ``write(name)`` on a temporary file in the same folder, then rename it to ``path``.
 
-    **Raises** InputError where the folder cannot be written; the file that was there is kept.
+    **Raises** InputError if the folder cannot be written. An old file is then kept.
     """
     path = Path(path)
     try:
@@ -185,7 +194,7 @@ def write_atomically(path: Path, write: Callable[[str], object]) -> None:
 
 
 def check_output(path: str | os.PathLike) -> None:
-    """Raise InputError if a mesh could not be written there: suffix or folder are wrong.
+    """Raise InputError if the suffix is unknown or the folder cannot be written.
 
     Example:
         >>> import jaxdeform as jd
@@ -197,7 +206,7 @@ def check_output(path: str | os.PathLike) -> None:
 
 
 def check_place(path: Path) -> None:
-    """Raise InputError if no file could be written there."""
+    """Raise InputError if no file can be written at this path."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder: give the name of a file")
     if not path.parent.is_dir():

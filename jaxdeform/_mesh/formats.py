@@ -1,4 +1,4 @@
-"""Mesh files as bytes: OBJ, OFF, PLY and STL to arrays and back."""
+"""Mesh formats: OBJ, OFF, PLY and STL, from bytes to arrays and back."""
 
 import re
 from collections.abc import Callable
@@ -25,25 +25,27 @@ def _polygon(path: Path, where: str, corners: int) -> InputError:
 
 
 def _rows(data: bytes) -> list[list[bytes]]:
-    """Return the words of each line, without comments and empty lines."""
+    """Return the words of each line; comments and empty lines are left out."""
     rows = (line.split(b"#", 1)[0].split() for line in data.splitlines())
     return [row for row in rows if row]
 
 
-def _vertices(path: Path, rows: list[list[bytes]], columns: slice) -> Float[np.ndarray, "n c"]:
-    """Return these columns of the rows as numbers, three at least."""
+def _vertices(
+    path: Path, rows: list[list[bytes]], columns: slice
+) -> Float[np.ndarray, "rows columns"]:
+    """Return these columns of the rows as numbers, at least three."""
     out = []
     for row in rows:
         try:
             x, y, z, *more = map(float, row[columns])
         except ValueError:
-            raise _broken(path, f"the line {_shown(row)} is no vertex") from None
+            raise _broken(path, f"the line {_shown(row)} is not a vertex") from None
         out.append((x, y, z, *more))
     return np.array(out, np.float64) if out else np.empty((0, 3))
 
 
-def _triangles(path: Path, rows: list[list[bytes]]) -> Int[np.ndarray, "m 3"]:
-    """Return faces given as rows ``3 i j k ...``."""
+def _triangles(path: Path, rows: list[list[bytes]]) -> Int[np.ndarray, "faces 3"]:
+    """Return the faces from rows of the form ``3 i j k ...``."""
     out = np.empty((len(rows), 3), np.int64)
     for k, row in enumerate(rows):
         try:
@@ -54,7 +56,7 @@ def _triangles(path: Path, rows: list[list[bytes]]) -> Int[np.ndarray, "m 3"]:
         except InputError:
             raise
         except (ValueError, IndexError, OverflowError):
-            raise _broken(path, f"the line {_shown(row)} is no face") from None
+            raise _broken(path, f"the line {_shown(row)} is not a face") from None
     return out
 
 
@@ -74,21 +76,23 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
             try:
                 face = [int(word.split(b"/", 1)[0]) for word in words[1:]]
             except ValueError:
-                raise _broken(path, f"line {number} is no face") from None
-            # Negative numbers count back from the vertices so far.
+                raise _broken(path, f"line {number} is not a face") from None
+            # Negative indices count back from the last vertex so far.
             corners.append([k - 1 if k > 0 else len(points) + k if k < 0 else -1 for k in face])
     vertices = _vertices(path, points, slice(3))
     announced = {kind: int(count) for kind, count in _OBJ_COUNT.findall(data)}
     for kind, found in ((b"Vertices", points), (b"Faces", corners)):
         if len(found) < announced.get(kind, 0):
-            raise _broken(path, f"announces {announced[kind]} {kind.decode().lower()}, holds fewer")
+            raise _broken(
+                path, f"announces {announced[kind]} {kind.decode().lower()} but holds fewer"
+            )
     try:
         return vertices, np.array(corners, np.int64).reshape(-1, 3)
     except OverflowError:
         raise _broken(path, "names a vertex out of range") from None
 
 
-# As MeshLab writes it too; without it nobody could tell an OBJ that lost its end.
+# MeshLab writes these counts too. Without them a truncated OBJ could not be recognised.
 _OBJ_COUNT = re.compile(rb"^# (Vertices|Faces): (\d{1,12})\s*$", re.MULTILINE)
 
 
@@ -105,10 +109,10 @@ def _text(lines: list[str]) -> bytes:
 
 def _parse_off(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     rows = _rows(data)
-    # COFF, NOFF and the like put colours or normals after the position; 4OFF changes it.
+    # COFF, NOFF and the like add colours or normals after the position. 4OFF changes the position.
     if not rows or not re.fullmatch(rb"(ST)?C?N?OFF", rows[0][0], re.IGNORECASE):
-        raise InputError(f"{path}: does not start with OFF: is it another kind of file?")
-    # The counts may stand on the first line or on the next.
+        raise InputError(f"{path}: does not start with OFF: check that it is an OFF file")
+    # The counts are on the first line or on the next.
     head = rows[0][1:] or (rows[1] if len(rows) > 1 else [])
     body = rows[1 if rows[0][1:] else 2 :]
     try:
@@ -116,7 +120,7 @@ def _parse_off(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     except (IndexError, ValueError):
         raise _broken(path, "has no counts of vertices and faces") from None
     if not 0 <= n + m <= len(body) or min(n, m) < 0:
-        raise _broken(path, f"announces {n} vertices and {m} faces, and holds fewer")
+        raise _broken(path, f"announces {n} vertices and {m} faces but holds fewer")
     return _vertices(path, body[:n], slice(3)), _triangles(path, body[n : n + m])
 
 
@@ -146,13 +150,13 @@ _PLY_KINDS = {
 class _PlyHeader:
     encoding: str
     size: int
-    """Where the body begins."""
+    """Length of the header in bytes: the body starts here."""
     n_vertices: int
     n_faces: int
     vertex: list[tuple[str, str]]
     """(name, kind) of each property."""
     face: list[tuple[str, str, str]]
-    """(name, kind of the count, kind of the entries); no kind of the count for a single number."""
+    """(name, kind of the count, kind of the entries); the count of a single number has no kind."""
 
 
 def _ply_header(path: Path, data: bytes) -> _PlyHeader:
@@ -176,12 +180,12 @@ def _ply_header(path: Path, data: bytes) -> _PlyHeader:
                 properties.append((words[2], "", _PLY_KINDS[words[1]]))
         (n_vertices, vertex), (n_faces, face) = elements["vertex"], elements["face"]
     except (KeyError, IndexError, ValueError):
-        raise _broken(path, "has a PLY header that names no vertices and faces") from None
+        raise _broken(path, "has a PLY header without vertices and faces") from None
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise _broken(path, f"has the unknown PLY format '{encoding}'")
     if list(elements)[:2] != ["vertex", "face"] or any(count for _, count, _ in vertex):
         raise InputError(
-            f"{path}: its PLY elements are laid out in an unusual way ({', '.join(elements)}): "
+            f"{path}: its PLY elements are in an unusual order ({', '.join(elements)}): "
             "export it with plain vertices first, then faces"
         )
     if min(n_vertices, n_faces) < 0 or not {"x", "y", "z"} <= {name for name, *_ in vertex}:
@@ -197,7 +201,7 @@ def ply_columns(path: Path, data: bytes) -> tuple[dict[str, np.ndarray], np.ndar
     names = [name for name, *_ in header.face]
     which = next((k for k, name in enumerate(names) if name.startswith("vertex_ind")), -1)
     if which < 0 or not header.face[which][1]:
-        raise _broken(path, "has a PLY header whose faces name no vertex_indices")
+        raise _broken(path, "has a PLY header whose faces have no vertex_indices")
     read = _ply_ascii if header.encoding == "ascii" else _ply_binary
     return read(path, data, header, which)
 
@@ -207,14 +211,14 @@ def _ply_ascii(path: Path, data: bytes, header: _PlyHeader, which: int):
     n, m, width = header.n_vertices, header.n_faces, len(header.vertex)
     short = next((row for row in rows[:n] if len(row) < width), None)
     if len(rows) < n + m or short:
-        raise _broken(path, f"announces {n} vertices and {m} faces, and holds fewer")
+        raise _broken(path, f"announces {n} vertices and {m} faces but holds fewer")
     table = _vertices(path, rows[:n], slice(width)).reshape(n, width)
     faces = rows[n : n + m]
-    for _, count, _ in header.face[:which]:  # what stands before the corners
+    for _, count, _ in header.face[:which]:  # properties before the corners
         try:
             faces = [row[1 + int(row[0]) if count else 1 :] for row in faces]
         except (IndexError, ValueError):
-            raise _broken(path, "has a line that is no face") from None
+            raise _broken(path, "has a line that is not a face") from None
     columns = {name: table[:, k].copy() for k, (name, _) in enumerate(header.vertex)}
     return columns, _triangles(path, faces)
 
@@ -226,7 +230,7 @@ def _ply_binary(path: Path, data: bytes, header: _PlyHeader, which: int):
         record = np.dtype([(name, order + kind) for name, kind in header.vertex])
         table = np.frombuffer(data, record, header.n_vertices, header.size)
         begin = header.size + table.nbytes
-        # Lists are as long in every face as in the first, or the file is refused below.
+        # Assume that lists are as long in every face as in the first; checked below.
         fields, lists, at = [], [], begin
         for name, count, kind in header.face if header.n_faces else []:
             length = 1
@@ -260,7 +264,7 @@ def _parse_ply(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_ply(points: np.ndarray, faces: np.ndarray, rigidity: np.ndarray | None = None) -> bytes:
-    """Return a binary PLY file, with the vertex property rigidity if given."""
+    """Return the content of a binary PLY file, with the vertex property rigidity if given."""
     columns = dict(zip("xyz", points.T, strict=True))
     if rigidity is not None:
         columns["rigidity"] = np.broadcast_to(rigidity, len(points))
@@ -283,7 +287,7 @@ def _parse_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     elif data.lstrip().startswith(b"solid"):
         corners = _stl_ascii(path, data)
     else:
-        raise _broken(path, "is neither ASCII STL nor as long as its count of faces says")
+        raise _broken(path, "is neither ASCII STL nor as long as its face count says")
     return corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3)
 
 
@@ -319,9 +323,9 @@ class Format(NamedTuple):
     """How to read and write one kind of file."""
 
     parse: Callable[[Path, bytes], tuple[np.ndarray, np.ndarray]]
-    """(path, for the messages; content) to vertices and faces, or InputError."""
+    """From (path, content) to vertices and faces, or InputError; the path is for its text."""
     to_bytes: Callable[[np.ndarray, np.ndarray], bytes]
-    """Vertices and faces to the content of a file."""
+    """From vertices and faces to the content of a file."""
 
 
 FORMATS = {

@@ -1,4 +1,4 @@
-"""Reporting what is wrong with a mesh, and repairing it."""
+"""Report what is wrong with a mesh, and repair it."""
 
 import os
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from jaxdeform._mesh.mesh import (
 )
 from jaxdeform.errors import ArrayLike, InputError
 
-# A broken mesh cannot be made a Mesh, so what mends and inspects takes it in any of three forms.
+# A broken mesh cannot become a Mesh, so the functions below take it in any of three forms.
 MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike
 
 
@@ -34,14 +34,14 @@ def _arrays(mesh: object) -> tuple[ArrayLike, ArrayLike]:
 
 
 def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
-    """Merge equal vertices; drop degenerate and repeated faces and unreferenced vertices.
+    """Merge equal vertices; drop degenerate faces, repeated faces and unreferenced vertices.
 
     **Arguments**: mesh, a :class:`Mesh`, a pair (vertices, faces), or the path of a file.
 
-    **Returns** the new mesh and, for each old vertex, its new index or -1 where it was dropped.
+    **Returns** the new mesh and, for each old vertex, its new index, or -1 if it was dropped.
 
-    **Raises** InputError: indices out of range or vertices that are not finite (nothing sensible
-    can be done), or no face is left.
+    **Raises** InputError: an index is out of range or a vertex is not finite (no repair makes sense
+    then); no face is left; the file cannot be read.
 
     Example:
         >>> import jaxdeform as jd
@@ -57,7 +57,7 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
     _, keep = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(keep)]
     if not len(faces):
-        raise InputError("no face with an area is left after mending: the mesh is empty")
+        raise InputError("no face with an area is left after the repair: export the mesh again")
     used = np.unique(faces)
     new = np.full(len(points), -1)
     new[used] = np.arange(len(used))
@@ -66,12 +66,12 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What :func:`inspect` found; ``str()`` of it is a report."""
+    """What :func:`inspect` found; ``str()`` turns it into a report."""
 
     counts: dict[str, int | float]
-    """Sizes and measures by name."""
+    """Sizes and measures by name: lengths in the unit of the mesh, angles in degrees."""
     findings: tuple[str, ...]
-    """What is wrong or unusual, a sentence each, with what jaxdeform does about it."""
+    """What is wrong or unusual, one sentence each, and what jaxdeform does about it."""
 
     def __str__(self) -> str:
         """Return the report."""
@@ -83,10 +83,13 @@ class Inspection:
 
 
 def inspect(mesh: MeshLike) -> Inspection:
-    """Report what is wrong or unusual with a mesh, broken ones included.
+    """Report what is wrong or unusual with a mesh, even if it is broken.
 
     **Arguments**: mesh, a :class:`Mesh`, a pair (vertices, faces), or the path of a file.
-    **Raises** InputError only for a file that cannot be read.
+
+    **Returns** an :class:`Inspection`.
+
+    **Raises** InputError only if the argument is none of these or the file cannot be read.
 
     Example:
         >>> import jaxdeform as jd
@@ -108,17 +111,21 @@ def inspect(mesh: MeshLike) -> Inspection:
     bad = degenerate_faces(points, faces)
     repeating = [k for reason, k in bad if reason.startswith("repeats")]
     flat = [k for reason, k in bad if reason.startswith("has")]
-    mend = "jd.repair drops them"
-    report(len(repeating), f"faces repeat a vertex (face {(repeating or [0])[0]})", mend)
-    report(len(flat), f"faces have no area (face {(flat or [0])[0]})", mend)
+    remedy = "jd.repair drops them"
+    report(len(repeating), f"faces repeat a vertex (face {(repeating or [0])[0]})", remedy)
+    report(len(flat), f"faces have no area (face {(flat or [0])[0]})", remedy)
     sound = np.delete(faces, [k for _, k in bad], axis=0)
     sound = sound[np.unique(np.sort(sound, axis=1), axis=0, return_index=True)[1]]
     unreferenced = n - len(np.unique(faces))
     report(unreferenced, "vertices belong to no face", "they stay where they are")
     duplicates = n - len(np.unique(points, axis=0))
-    report(duplicates, "vertices lie exactly on another", "the mesh is not joined there; jd.repair")
+    report(
+        duplicates,
+        "vertices lie exactly on another",
+        "the mesh is not joined there; jd.repair merges",
+    )
     repeated = m - len(np.unique(np.sort(faces, axis=1), axis=0))
-    report(repeated, "faces are there twice", "their edges weigh double; jd.repair drops them")
+    report(repeated, "faces are repeated", "their edges weigh double; jd.repair drops them")
     counts: dict[str, int | float] = {"vertices": n, "faces": m}
     if len(sound):
         _inspect_structure(points, sound, counts, report)
@@ -134,7 +141,7 @@ def _inspect_structure(points, faces, counts, report) -> None:
     used = np.unique(faces)
     components = len(np.unique(label[used]))
     counts["components"] = components
-    report(components - 1, "further connected parts", "each needs a handle of its own")
+    report(components - 1, "further connected components", "each needs a handle of its own")
 
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     pairs, inverse, times = np.unique(
@@ -143,12 +150,12 @@ def _inspect_structure(points, faces, counts, report) -> None:
     border, crowded = int((times == 1).sum()), int((times > 2).sum())
     counts["border edges"] = border
     counts["Euler characteristic"] = len(used) - len(pairs) + len(faces)
-    report(border, "edges lie on the border", "the surface is open there, which is fine")
-    report(crowded, "edges have more than two faces", "non-manifold, deformed all the same")
+    report(border, "edges lie on the border", "the surface is open there, which is allowed")
+    report(crowded, "edges have more than two faces", "non-manifold, which is allowed")
     report(
         int((_fans(faces, inverse.ravel()) > 1).sum()),
         "vertices join surfaces that meet nowhere else",
-        "non-manifold, deformed all the same",
+        "non-manifold, which is allowed",
     )
     ascending = np.where(directed[:, 0] < directed[:, 1], 1, -1)
     twist = np.bincount(inverse.ravel(), ascending)
@@ -157,18 +164,22 @@ def _inspect_structure(points, faces, counts, report) -> None:
     center = points[used].mean(axis=0)
     a, b, c = (points[faces[:, k]] - center for k in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-    part = label[faces[:, 0]]
-    open_parts = np.unique(label[pairs[times != 2][:, 0]])
-    inward = [k for k in np.unique(part) if k not in open_parts and volume[part == k].sum() < 0]
-    report(len(inward), "closed parts face inwards", "harmless: normals turn with the surface")
+    component = label[faces[:, 0]]
+    is_open = np.unique(label[pairs[times != 2][:, 0]])
+    inward = [
+        k for k in np.unique(component) if k not in is_open and volume[component == k].sum() < 0
+    ]
+    report(
+        len(inward), "closed components face inwards", "harmless: normals rotate with the surface"
+    )
 
 
-def _fans(faces: np.ndarray, edge: np.ndarray) -> Int[np.ndarray, "n"]:
-    """Return for each vertex how many fans of faces meet there: faces joined by edges at it.
+def _fans(faces: np.ndarray, edge: np.ndarray) -> Int[np.ndarray, "vertices"]:
+    """Return how many fans meet at each vertex. A fan is a set of faces joined by edges at it.
 
-    edge numbers the undirected edges of each face: corners 0-1, 1-2, 2-0.
+    ``edge`` numbers the undirected edges of each face, in the order 0-1, 1-2, 2-0 of its corners.
     """
-    # Corners of one vertex are joined where their faces share an edge that ends there.
+    # Two corners at a vertex belong to the same fan if their faces share an edge that ends there.
     corner = np.arange(faces.size).reshape(-1, 3)
     node = corner[:, [0, 1, 1, 2, 2, 0]].ravel()
     key = np.repeat(edge, 2) * (faces.max() + 1) + faces.ravel()[node]
@@ -196,13 +207,13 @@ def _inspect_angles(points, faces, counts, report) -> None:
     counts["largest angle"] = float(angle.max())
     radians = np.radians(angle)
     cot = np.cos(radians) / np.maximum(np.sin(radians), 1e-300)
-    # The angle at corner k is opposite to the edge from k + 1 to k + 2.
+    # The angle at corner k is opposite the edge from corner k + 1 to corner k + 2.
     opposite = np.sort(np.stack([np.roll(faces, -1, 1), np.roll(faces, -2, 1)], axis=2), axis=2)
     _, inverse = np.unique(opposite.reshape(-1, 2), axis=0, return_inverse=True)
     weight = np.bincount(inverse.ravel(), cot.ravel()) / 2
     report(
         int((weight < -1e-9).sum()),
         "edges have negative cotangent weights (obtuse angles)",
-        "kept where the cells stay bounded, else set to 0 (see jd.rings)",
+        "kept, but set to 0 in cells whose moments they make indefinite (see jd.rings)",
     )
     report(int((angle < 1.0).sum()), "angles are below 1 degree", "expect slower convergence there")

@@ -10,25 +10,29 @@ from jaxtyping import Bool, Float, Int
 
 from jaxdeform.errors import ArrayLike, InputError
 
-# A triangle lower than this fraction of its longest edge has no area that float64 could tell from
-# rounding: its cotangents would be noise. Thin but real triangles (0.4 degrees) are 1e10 above it.
+# A triangle has no area if its height is below this fraction of its longest edge: float64 cannot
+# tell such an area from rounding, and the cotangents would be noise. Thin but real triangles
+# (0.4 degrees) lie a factor of 1e10 above it.
 _FLAT = 1e-13
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
-    """A triangle mesh: checked once, when it is made, and frozen.
+    """A triangle mesh, checked once when it is made, then frozen.
 
-    Open borders, several components, unreferenced vertices, non-manifold edges and vertices, and
-    faces that point inwards are all allowed; :func:`inspect` reports them.
+    Open borders, several connected components, unreferenced vertices, non-manifold edges and
+    vertices, and inward-facing faces are all allowed; :func:`inspect` reports them.
 
-    A mesh is a value. Two meshes with the same numbers are equal and hash alike, also after pickle
-    or in another process. Its arrays are read-only: copy one before you change it.
+    A mesh is a value. Two meshes with the same numbers are equal and have the same hash, even after
+    pickling or in another process. The arrays are read-only: copy one before you change it.
 
-    **Arguments**: vertices (vertices, 3), any unit of length; faces (faces, 3), vertex indices.
+    **Arguments**
 
-    **Raises** InputError: arrays of the wrong shape or empty; a vertex that is not finite; a face
-    index out of range; a face that repeats a vertex or has no area (:func:`repair` drops those).
+    - vertices: (vertices, 3), in any unit of length.
+    - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
+
+    **Raises** InputError: an array is empty or has the wrong shape; a vertex is not finite; a face
+    index is out of range; a face repeats a vertex or has no area (:func:`repair` drops those).
 
     Example:
         >>> import jaxdeform as jd
@@ -37,7 +41,7 @@ class Mesh:
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
-    """Positions, any unit of length."""
+    """Positions, in any unit of length."""
     faces: Int[np.ndarray, "faces 3"]
     """Vertex indices, counter-clockwise seen from outside."""
 
@@ -65,12 +69,12 @@ class Mesh:
 
     @cached_property
     def edges(self) -> Int[np.ndarray, "edges 2"]:
-        """Undirected edges (i < j), each once, sorted."""
+        """Undirected edges (i < j), each once, in ascending order."""
         return unique_edges(self.faces)
 
     @cached_property
     def referenced(self) -> Bool[np.ndarray, "vertices"]:
-        """True for the vertices that belong to a face."""
+        """True for each vertex that belongs to a face."""
         mask = np.zeros(self.n_vertices, bool)
         mask[self.faces.ravel()] = True
         return mask
@@ -87,7 +91,7 @@ class Mesh:
 
     @cached_property
     def digest(self) -> bytes:
-        """Fingerprint of the content: equal for equal meshes, in any process."""
+        """A fingerprint of the content: the same for equal meshes, in every process."""
         return content_digest(self.vertices, self.faces)
 
     def __eq__(self, other: object) -> bool:
@@ -99,7 +103,7 @@ class Mesh:
         return hash(self.digest)
 
     def __reduce__(self):
-        """Pickle the two arrays; they are checked and frozen again on loading."""
+        """Pickle the two arrays; loading checks and freezes them again."""
         return Mesh, (self.vertices, self.faces)
 
     def __repr__(self) -> str:
@@ -108,7 +112,7 @@ class Mesh:
 
 
 def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return copies with valid shapes, finite vertices and indices in range, or raise."""
+    """Return copies of valid shape, with finite vertices and indices in range, or raise."""
     try:
         points = np.array(vertices, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
@@ -116,33 +120,40 @@ def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, n
     try:
         corners = np.array(faces, order="C")
     except ValueError as error:
-        raise InputError(f"faces are no table of indices: {error}: give (m, 3)") from error
+        raise InputError(
+            f"faces cannot be read as an array of indices: {error}: give (faces, 3)"
+        ) from error
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise InputError(f"vertices have shape {points.shape}: give (n, 3) with n >= 1")
+        raise InputError(
+            f"vertices have shape {points.shape}: give (vertices, 3), at least one vertex"
+        )
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
-        raise InputError(f"faces have shape {corners.shape}: give (m, 3) triangles with m >= 1")
+        raise InputError(
+            f"faces have shape {corners.shape}: give (faces, 3) triangles, at least one"
+        )
     if corners.dtype.kind not in "iu":
         raise InputError(f"faces must be integers, got {corners.dtype}: give vertex indices")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise InputError(
-            f"vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} such): give finite positions"
+            f"vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} in total): give finite "
+            "positions"
         )
     corners = corners.astype(np.int64)
     bad = np.flatnonzero(((corners < 0) | (corners >= len(points))).any(axis=1))
     if bad.size:
         raise InputError(
-            f"face {bad[0]} {corners[bad[0]].tolist()} names a vertex out of range: there are "
-            f"vertices 0 to {len(points) - 1}"
+            f"face {bad[0]} {corners[bad[0]].tolist()} names a vertex out of range: vertices "
+            f"are 0 to {len(points) - 1}"
         )
     return points, corners
 
 
 def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, int]]:
-    """Return (reason, face) of the faces that repeat a vertex or have no area."""
+    """Return (reason, face) for each face that repeats a vertex or has no area."""
     repeats = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     found = [("repeats a vertex", int(k)) for k in np.flatnonzero(repeats)]
-    # Scaled, first as a whole and then per face, so that no size leaves the range of float64.
+    # Scale the mesh as a whole, then each face, so that no number leaves the range of float64.
     corner = (points / (np.abs(points).max() or 1.0))[faces]
     u, v, w = (corner[:, i] - corner[:, j] for i, j in ((1, 0), (2, 0), (2, 1)))
     longest = np.abs(np.concatenate([u, v, w], axis=1)).max(axis=1)
@@ -154,7 +165,7 @@ def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, i
 
 def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    # Encoded as one number a pair, because np.unique over rows is ten times slower.
+    # Encode each pair as one number, because np.unique over rows is ten times slower.
     n = int(faces.max()) + 1
     code = np.unique(pairs[:, 0] * n + pairs[:, 1])
     return np.stack([code // n, code % n], axis=1)
@@ -170,7 +181,7 @@ def connected_components(
 
 
 def content_digest(*arrays: np.ndarray) -> bytes:
-    """Return a 128-bit fingerprint of the shapes, types and numbers of some arrays."""
+    """Return a 128-bit fingerprint of the shapes, dtypes and numbers of some arrays."""
     digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
         digest.update(f"{array.shape} {array.dtype.str}".encode())
@@ -179,8 +190,8 @@ def content_digest(*arrays: np.ndarray) -> bytes:
 
 
 def merge_equal_points(points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct points in order of appearance, and for each old point its new index."""
-    points = points + 0.0  # makes -0.0 equal to 0.0
+    """Return the distinct points in order of appearance, and the new index of each old point."""
+    points = points + 0.0  # turns -0.0 into 0.0
     _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)

@@ -1,4 +1,4 @@
-"""Deforming a part: cut out what can move, deform it, put it back (thesis Sec. 4.1.4)."""
+"""Deform a piece of a mesh: cut it out, deform it, put it back (thesis Sec. 4.1.4)."""
 
 from dataclasses import dataclass
 
@@ -12,28 +12,32 @@ from jaxdeform.errors import ArrayLike, InputError
 
 @dataclass(frozen=True, eq=False)
 class Submesh:
-    """A piece of a mesh around its free vertices; made by :func:`submesh`."""
+    """A piece of a mesh around the free vertices; made by :func:`submesh`."""
 
     mesh: Mesh
-    """The piece as a mesh of its own."""
+    """The piece, as a mesh of its own."""
     cells: Cells
-    """Its cells: those of the whole that contain a free vertex; the others are empty."""
-    handles: Int[np.ndarray, "h"]
-    """Vertices of the piece that are not free (piece's indices)."""
+    """The cells of the whole mesh that contain a free vertex; the other cells are empty."""
+    handles: Int[np.ndarray, "handles"]
+    """The vertices of the piece that are not free, by their index in the piece."""
     index: Int[np.ndarray, "piece"]
-    """The whole's index of each vertex of the piece."""
+    """The index in the whole mesh of each vertex of the piece."""
     whole: Mesh
-    """The mesh that it was cut from."""
+    """The mesh that the piece was cut from."""
 
     def reinsert(
         self, vertices: ArrayLike, base: ArrayLike | None = None
-    ) -> Float[np.ndarray, "n 3"]:
-        """Return the whole mesh's positions with the piece put back.
+    ) -> Float[np.ndarray, "vertices 3"]:
+        """Return the positions of the whole mesh, with the piece put back.
 
-        **Arguments**: vertices (piece, 3), the deformed piece; base (n, 3), positions of all other
-        vertices (their rest positions if left out).
+        **Arguments**
 
-        **Raises** InputError for wrong shapes.
+        - vertices: (piece, 3), the deformed piece.
+        - base: (vertices, 3), positions for all other vertices; by default their rest positions.
+
+        **Returns** (vertices, 3).
+
+        **Raises** InputError: a shape is wrong.
         """
         piece = np.asarray(vertices)
         if piece.shape != (len(self.index), 3):
@@ -47,33 +51,36 @@ class Submesh:
 
 
 def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
-    """Cut out the cells in which something can move, and no more.
+    """Cut out the cells that contain a free vertex, and nothing else.
 
-    A cell of fixed vertices only has a fixed transformation, so it may be left out: the piece
-    deforms exactly as it would within the whole (to rounding).
+    A cell whose vertices are all fixed has a fixed transformation, so it can be left out: the piece
+    deforms exactly as it would within the whole mesh (up to rounding).
 
     **Arguments**
 
-    - mesh: the whole.
-    - free: indices of the vertices that may move, or a mask (n,).
-    - cells: those of the whole; ``rings(mesh, 1)`` if left out.
+    - mesh: the whole mesh.
+    - free: indices of the vertices that may move, or a mask (vertices,).
+    - cells: the cells of the whole mesh; by default ``rings(mesh, 1)``.
 
-    **Raises** InputError: no free vertex, or an index out of range.
+    **Returns** a :class:`Submesh`.
+
+    **Raises** InputError: no vertex is free; an index is out of range; the cells are of another
+    mesh.
 
     Example:
         >>> import jaxdeform as jd
         >>> mesh = jd.shapes.bar()
-        >>> part = jd.submesh(mesh, mesh.vertices[:, 1] > 120)
-        >>> problem = jd.precompute(part.mesh, part.handles, cells=part.cells)
-        >>> out = jd.deform(problem, part.mesh.vertices[part.handles], 1.0)
-        >>> part.reinsert(out.vertices).shape
+        >>> piece = jd.submesh(mesh, mesh.vertices[:, 1] > 120)
+        >>> problem = jd.precompute(piece.mesh, piece.handles, cells=piece.cells)
+        >>> out = jd.deform(problem, piece.mesh.vertices[piece.handles], 1.0)
+        >>> piece.reinsert(out.vertices).shape
         (722, 3)
     """
     cells = rings(mesh, 1) if cells is None else cells
     if cells.mesh != mesh:
-        raise InputError("cells are of another mesh: call rings(mesh, r) on this one")
+        raise InputError("cells are of another mesh: call rings(mesh, r) for this one")
     is_free = _mask(free, mesh.n_vertices)
-    # The vertices of each cell, its centre included.
+    # The vertices of each cell, including its centre.
     reach = cells.reach
     moving = np.asarray((reach @ is_free.astype(np.int32)) > 0).ravel()
     kept = np.unique(reach[moving].indices)
@@ -83,10 +90,11 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     faces = new[mesh.faces]
     faces = faces[(faces >= 0).all(axis=1)]
     if not len(faces):
-        raise InputError("the free vertices belong to no face: nothing can be cut out")
+        raise InputError("the free vertices belong to no face: free a vertex that does")
     piece = Mesh(mesh.vertices[index], faces)
 
-    # The piece's edges among the whole's: both lists are sorted, and so is the renumbering.
+    # Find the edges of the piece among those of the whole. Both lists are sorted, and renumbering
+    # keeps the order.
     n = mesh.n_vertices
     whole_code = cells.edges[:, 0] * n + cells.edges[:, 1]
     piece_code = index[piece.edges[:, 0]] * n + index[piece.edges[:, 1]]
@@ -96,8 +104,8 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
         np.int8
     )
     membership.eliminate_zeros()
-    part_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
-    return Submesh(piece, part_cells, np.flatnonzero(~is_free[index]), index, mesh)
+    piece_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
+    return Submesh(piece, piece_cells, np.flatnonzero(~is_free[index]), index, mesh)
 
 
 def _mask(free: ArrayLike, n: int) -> np.ndarray:
@@ -115,5 +123,5 @@ def _mask(free: ArrayLike, n: int) -> np.ndarray:
         mask = np.zeros(n, bool)
         mask[given] = True
     if not mask.any():
-        raise InputError("no vertex is free: there is nothing to deform")
+        raise InputError("no vertex is free, so nothing can deform: give at least one")
     return mask

@@ -190,7 +190,7 @@ def test_mistakes_found_while_precomputing(run, files):
         "-o", files / "out.off",
     )  # fmt: skip
     assert code == 2
-    assert err.startswith("jaxdeform: the connected part with vertex 722")
+    assert err.startswith("jaxdeform: the connected component with vertex 722")
     assert not (files / "out.off").exists()
 
 

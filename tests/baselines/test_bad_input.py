@@ -49,8 +49,8 @@ def bad_calls():
         "vertices of vertex 4 are not finite": lambda: dqs(nan, weights, moves),
         "vertices have shape": lambda: dqs(vertices[:, :2], weights, moves),
         "a weight of vertex 3 is -0.5": lambda: dqs(vertices, negative, moves),
-        "the matrix of control 2 is no rotation": lambda: dqs(vertices, weights, stretched),
-        "the matrix of control 1 is no rotation": lambda: dqs(vertices, weights, mirrored),
+        "the matrix of control 2 is not a rotation": lambda: dqs(vertices, weights, stretched),
+        "the matrix of control 1 is not a rotation": lambda: dqs(vertices, weights, mirrored),
         "rotations have shape": lambda: jd.rigid_transforms([0, 0, 1], [0, 0, 0], [0, 0, 0]),
         "centers have shape": lambda: jd.rigid_transforms([[0, 0, 1]], [[0, 0, 0]], [0, 0, 0]),
         "bone 1 has length zero": lambda: idw(vertices, bones),
@@ -70,9 +70,9 @@ def bad_calls():
         "the group of handle 1 is -1": lambda: bbw(square, [0, 8], [0, -1]),
         "group has shape": lambda: bbw(square, [0, 8], [0]),
         "vertex 9 belongs to no face": lambda: bbw(loose, [0]),
-        "part with vertex 9 .*no handle": lambda: bbw(two, [0]),
+        "component with vertex 9 .*no handle": lambda: bbw(two, [0]),
         "the cage is open, .*edge": lambda: mvc(square.vertices, square),
-        "turned against each other, at the edge": lambda: mvc(
+        "oriented against each other, at the edge": lambda: mvc(
             [[0, 0, 0]], jd.Mesh(CUBE.vertices, [CUBE.faces[0][::-1], *CUBE.faces[1:]])
         ),
         r"vertex 1 \[0.0, 1.5, 0.0\] is outside": lambda: mvc([[0, 0, 0], [0, 1.5, 0]], CUBE),

@@ -180,7 +180,7 @@ def bad_calls(bar, problem, targets):
         "no handles": lambda: jd.precompute(bar, []),
         "handles must be integers": lambda: jd.precompute(bar, [0.5]),
         "one list of vertex indices": lambda: jd.precompute(bar, [[0, 1]]),
-        "part with vertex 722 .*no handle": lambda: jd.precompute(loose, [0]),
+        "component with vertex 722 .*no handle": lambda: jd.precompute(loose, [0]),
         "cells are of another mesh": lambda: jd.precompute(bar, [0], cells=jd.rings(short, 1)),
         "weight of handle 0 is -1": lambda: jd.precompute(bar, [0], handle_weights=-1.0),
         "r = 0 at vertex": lambda: jd.rings(bar, 0),

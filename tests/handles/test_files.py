@@ -101,14 +101,14 @@ def test_bad_groups_are_named(tmp_path, bar, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "is no JSON .*line 1 column 1"),
-        (b'{"handles": [{"vertices": [0, 1]}', "is no JSON"),
-        (b"[" * 100_000, "is no JSON"),
+        (b"", "is not valid JSON .*line 1 column 1"),
+        (b'{"handles": [{"vertices": [0, 1]}', "is not valid JSON"),
+        (b"[" * 100_000, "is not valid JSON"),
         (b"[1, 2]", r'give {"handles": \[group'),
         (b'{"handle": []}', r'give {"handles": \[group'),
         (b'{"handles": {}}', r'give {"handles": \[group'),
-        (b'{"handles": []}', "with one group at least"),
-        (b"\xff\xfe\x00", "is no text file"),
+        (b'{"handles": []}', "with at least one group"),
+        (b"\xff\xfe\x00", "is not a text file"),
     ],
 )
 def test_bad_json_is_named(tmp_path, bar, content, message):
@@ -154,8 +154,8 @@ def test_bad_survey_files_are_named(tmp_path):
     mesh = jd.shapes.square()
     good = "0 1 2 1 1 1 2 1 0"
     bad = {
-        "h.sel: has 8 numbers, the mesh 9 vertices": (good[2:], MATRIX),
-        "h.sel: vertex 4 is '3': 0 fixed, 1 free": ("0 1 2 1 3 1 2 1 0", MATRIX),
+        "h.sel: has 8 numbers, but the mesh has 9 vertices": (good[2:], MATRIX),
+        "h.sel: vertex 4 is '3': give 0 .fixed., 1": ("0 1 2 1 3 1 2 1 0", MATRIX),
         "h.sel: vertex 0 is 'x'": ("x 1 2 1 1 1 2 1 0", MATRIX),
         "h.sel: no handles": ("1 " * 9, MATRIX),
         "h.def: the matrix: give 4 x 4 finite numbers": (good, MATRIX[:-8]),

@@ -10,7 +10,10 @@ import jaxdeform as jd
 def test_bad_arrays_are_named():
     v, f = tetrahedron()
     bad = {
-        r"vertex 2 is \[0.0, nan, 0.0\] \(1 such\): give finite": (replaced(v, (2, 1), np.nan), f),
+        r"vertex 2 is \[0.0, nan, 0.0\] \(1 in total\)": (
+            replaced(v, (2, 1), np.nan),
+            f,
+        ),
         r"vertex 0 is \[inf": (replaced(v, (0, 0), np.inf), f),
         r"face 1 \[0, 1, 4\] names a vertex out of range": (v, replaced(f, (1, 2), 4)),
         r"face 3 \[-1, 3, 2\]": (v, replaced(f, (3, 0), -1)),
@@ -21,7 +24,7 @@ def test_bad_arrays_are_named():
         r"faces have shape \(0,\)": (v, []),
         r"faces have shape \(1, 4\)": (v, [[0, 1, 2, 3]]),
         "faces must be integers, got float64": (v, f * 1.0),
-        "faces are no table": (v, [[0, 1, 2], [0, 1]]),
+        "faces cannot be read as an array": (v, [[0, 1, 2], [0, 1]]),
         "vertices cannot be read as numbers": ([["a", "b", "c"]], f),
     }
     for message, (vertices, faces) in bad.items():
