@@ -20,9 +20,7 @@ def global_matrix(mesh: jd.Mesh):
     return stiffness(jd.rings(mesh, 1))
 
 
-def factors(
-    matrix, free: np.ndarray, positions: np.ndarray, dense_to: int
-) -> dict[str, Factor]:
+def factors(matrix, free: np.ndarray, positions: np.ndarray, dense_to: int) -> dict[str, Factor]:
     """Return a factor of each kind of the free part.
 
     The dense inverse is made for at most ``dense_to`` vertices.
