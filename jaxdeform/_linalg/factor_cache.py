@@ -119,7 +119,7 @@ class _Factor(NamedTuple):
 class _Entry:
     def __init__(self) -> None:
         self.factor: Future[_Factor] = Future()
-        self.bytes = 0
+        self.size = 0
         self.left_over = False
 
 
@@ -172,6 +172,12 @@ class FactorCache:
         # The collector may run anywhere, also in a thread that has the lock: so it only notes.
         weakref.finalize(owner, self._collected.append, name).atexit = False
 
+    @property
+    def size(self) -> int:
+        """What all factors take together, as estimated."""
+        with self._lock:
+            return sum(entry.size for entry in self._entries.values())
+
     def clear(self) -> None:
         """Let go of all factors."""
         with self._lock:
@@ -190,7 +196,7 @@ class FactorCache:
             raise
         entries, n = len(copy.rows), len(copy.free)
         with self._lock:
-            entry.bytes = int(entries * (_FACTOR_BYTES * np.log2(n + 1) + _MATRIX_BYTES))
+            entry.size = int(entries * (_FACTOR_BYTES * np.log2(n + 1) + _MATRIX_BYTES))
             if name in self._entries:
                 self._free_some(name)
         entry.factor.set_result(_Factor(copy, solver, threading.Lock()))
@@ -210,14 +216,14 @@ class FactorCache:
         left_over = [x for x in rest if self._entries[x].left_over]
         self._shrink(left_over, _LEFT_OVER, least=2)
         rest = sorted((x for x in rest if x in self._entries), key=lambda x: x not in left_over)
-        self._shrink(rest, self.capacity - self._entries[made].bytes, least=0)
+        self._shrink(rest, self.capacity - self._entries[made].size, least=0)
 
     def _shrink(self, names: list, limit: int, least: int) -> None:
-        total = sum(self._entries[x].bytes for x in names)
+        total = sum(self._entries[x].size for x in names)
         for name in names[: len(names) - least]:
             if total <= limit:
                 break
-            total -= self._entries.pop(name).bytes
+            total -= self._entries.pop(name).size
 
 
 def _mixed_up() -> ValueError:

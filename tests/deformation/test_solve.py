@@ -89,16 +89,6 @@ def test_other_handles_do_not_recompile(bar, bar_targets, bar_problem):
         assert compiled == []
 
 
-def test_a_gone_problem_says_so():
-    mesh = jd.shapes.cylinder()
-    problem = jd.precompute(mesh, [0])
-    run = jax.jit(lambda system, b: system.factor.solve(b))
-    system = problem.system
-    del problem
-    with pytest.raises(Exception, match="keep the problem"):
-        jax.block_until_ready(run(system, jnp.ones((3, 4802))))
-
-
 def test_results_say_what_happened(bar_problem, bar_targets):
     ran = jd.deform(bar_problem, bar_targets, 1.0, solver=jd.Alternating(3))
     assert "number of steps" in str(ran.result)
