@@ -1,6 +1,5 @@
 """jaxdeform: differentiable mesh deformation in JAX, every part with its own rigidity."""
 
-from jaxdeform import shapes
 from jaxdeform._baselines.cages import mean_value_coordinates
 from jaxdeform._baselines.laplacian_editing import (
     LaplacianEditor,
@@ -21,12 +20,22 @@ from jaxdeform._baselines.skinning_weights import (
 )
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
+from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.local_step import (
+    LBFGS,
+    AffineFit,
+    GradientDescent,
+    LocalStep,
+    Newton,
+    RotationFit,
+)
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
 from jaxdeform._handles.files import HandleFile, load_handles
 from jaxdeform._handles.rigid import rigid_targets
+from jaxdeform._handles.targets import bend, rotate, translate, twist
+from jaxdeform._mesh import shapes
 from jaxdeform._mesh.cells import Cells, rings, spokes
 from jaxdeform._mesh.files import load_mesh, load_rigidity, save_mesh
 from jaxdeform._mesh.inspection import Inspection, inspect, repair
@@ -47,10 +56,10 @@ from jaxdeform.estimation import (
 )
 from jaxdeform.plotting import render
 from jaxdeform.result import Result
-from jaxdeform.shapes import bend, rotate, translate, twist
 
 __all__ = [
     "LBFGS",
+    "Adjoint",
     "AffineFit",
     "Alternating",
     "Cells",
@@ -62,6 +71,7 @@ __all__ = [
     "InputError",
     "Inspection",
     "LaplacianEditor",
+    "LocalStep",
     "Mesh",
     "Newton",
     "Problem",
@@ -71,6 +81,7 @@ __all__ = [
     "RotationFit",
     "Skeleton",
     "Solution",
+    "Solver",
     "Submesh",
     "ThesisEstimate",
     "Unrolled",

@@ -10,6 +10,8 @@ class Result(eqx.Enumeration):
     batch).
     """
 
+    __module__ = "jaxdeform"  # where users find it, also in its repr
+
     steps_done = "Ran the number of steps that was asked for."
     converged = "Converged: a further step would change the objective by less than the tolerance."
     step_limit = (

@@ -19,7 +19,7 @@ PACKAGE = ROOT / "jaxdeform"
 # From the ground up. A module imports from lower floors, or from its own without a circle.
 FLOORS = [
     ["errors", "result"],
-    ["_mesh", "shapes"],
+    ["_mesh"],
     ["checks"],
     ["_linalg"],
     ["_handles"],

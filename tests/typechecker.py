@@ -1,4 +1,4 @@
-"""beartype for every function, but for the arguments of public ones, which check them themselves."""
+"""beartype for every function; public ones check their arguments themselves."""
 
 import ast
 from pathlib import Path

@@ -119,7 +119,7 @@ def demo(
             f"{float(solution.energy[-1]):.4g}",
             str(int(solution.steps)),
             _since(began),
-            str(solution.result),
+            jd.Result[solution.result],
         )
         poses.append(np.asarray(solution.vertices))
         jd.save_mesh(out / f"{name}.ply", mesh, vertices=poses[-1], rigidity=rigidity)
@@ -187,7 +187,7 @@ def deform(
     )
     energy, done = float(solution.energy[-1]), int(solution.steps)
     console.print(f"energy {energy:.6g} after {done} steps in {_since(began)}")
-    console.print(str(solution.result))
+    console.print(jd.Result[solution.result])
     color = values if out.suffix.lower() == ".ply" else None
     jd.save_mesh(out, shape, vertices=np.asarray(solution.vertices), rigidity=color)
     console.print(f"wrote {out}")

@@ -8,10 +8,10 @@ from jaxdeform._linalg.rotations import (
     matrices_from_quaternions,
     quaternion_product,
     quaternions_from_matrices,
+    rotation_matrices,
 )
 from jaxdeform.checks import as_array, check_positions, is_concrete, rows_of_three
 from jaxdeform.errors import ArrayLike, InputError
-from jaxdeform.shapes import rotation_matrices
 
 
 def rigid_transforms(

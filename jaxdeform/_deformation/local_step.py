@@ -37,6 +37,7 @@ from jaxdeform._linalg.small_matrices import (
     Vectors,
     as_grid,
     from_grid,
+    ldl_factor,
     ldl_solve,
     minus_identity,
     product,
@@ -267,15 +268,17 @@ def _solve_hessian(x: Grid, b: Vectors, rigidity: Scalars, floor: Scalars, right
     """Solve H dT = right in every cell.
 
     As a linear solve of its own, so that derivatives of second order solve again instead of
-    differentiating the 9x9 elimination, which takes minutes to compile.
+    differentiating the 9x9 elimination. H is factored outside of it: what solves for many right
+    sides, as conjugate gradients do, factors once.
     """
+    fixed = jax.lax.stop_gradient((x, list(b), rigidity, floor))
+    factor = ldl_factor(half_hessian(*fixed[:3]), fixed[3])
 
     def apply(v: Matrices) -> Matrices:
         return from_grid(half_hessian_product(x, list(b), rigidity, as_grid(v)))
 
     def solve(_, r: Matrices) -> Matrices:
-        entries = [r[i, j] for i in range(3) for j in range(3)]
-        solution = ldl_solve(half_hessian(x, list(b), rigidity), entries, floor)
+        solution = ldl_solve(factor, [r[i, j] for i in range(3) for j in range(3)])
         return from_grid([solution[3 * i : 3 * i + 3] for i in range(3)])
 
     return jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)

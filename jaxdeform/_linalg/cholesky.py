@@ -22,7 +22,8 @@ from jaxdeform._linalg.factor_cache import SHIFTS, Matrix, NotPositiveDefinite, 
 from jaxdeform._linalg.host_call import HostFunction, installed_interface
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
 
-# Up to this many vertices the inverse is kept as a dense matrix where there is an accelerator.
+# Up to this many vertices the inverse is kept as a dense matrix where a call to the host is dear:
+# where there is an accelerator, or no FFI (host_call.py).
 DENSE_BELOW = 1000
 
 
@@ -89,7 +90,7 @@ def factorise(
     dtype, exact = np.dtype(dtype), positions is not None
     shifts = SHIFTS[:1] if exact else SHIFTS
     accelerator = has_accelerator()
-    if accelerator and matrix.shape[0] <= DENSE_BELOW:
+    if (accelerator or not _host_solve.native) and matrix.shape[0] <= DENSE_BELOW:
         return _dense_inverse(Matrix.of(matrix, free), dtype, shifts)
     if accelerator and positions is not None:
         try:

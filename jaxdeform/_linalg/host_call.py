@@ -12,6 +12,8 @@ on GPUs and TPUs, the call is a ``jax.pure_callback``.
 """
 
 import _thread
+import atexit
+import contextlib
 import ctypes
 import re
 from collections.abc import Callable
@@ -118,6 +120,8 @@ class Interface:
         def handle(address: int) -> int | None:
             frame = frame_type.from_address(address)
             try:
+                if _exiting:
+                    raise RuntimeError("Python is about to exit")
                 if self._answers(frame.extension_start):
                     return None
                 if frame.stage == self.execute:
@@ -154,6 +158,27 @@ class Interface:
         return _FUNCTION(create)(ctypes.addressof(args))
 
 
+_names: list[str] = []
+_used: list[str] = []
+_exiting: list[bool] = []
+
+
+def _leave() -> None:
+    """Let no program that still runs call Python when Python is gone.
+
+    JAX returns before a program has ended. A call that comes while the interpreter shuts down ends
+    its thread, and XLA's client, when Python frees it, waits for that thread for ever.
+    """
+    if _used:
+        for array in jax.live_arrays("cpu"):
+            with contextlib.suppress(Exception):
+                array.block_until_ready()
+        # What runs now has results that nobody kept. It may fail, and the client is not freed.
+        _exiting.append(True)
+        client = jax.devices("cpu")[0].client
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
+
+
 def installed_interface() -> Interface | None:
     """Return the interface of the jaxlib in use; None where its header is missing or unknown."""
     try:
@@ -173,8 +198,11 @@ class HostFunction:
         Under vmap all arrays get the same number of leading axes. Those of an operand that is the
         same for all have size 1.
         """
-        self._name, self._function, self._native = name, function, interface is not None
+        self._name, self._function, self.native = name, function, interface is not None
         if interface is not None:
+            if not _names:
+                atexit.register(_leave)
+            _names.append(name)
             pointer = _FUNCTION(interface.handler(function))
             # Threads of XLA may call it until the process ends, so it is never collected.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(pointer))
@@ -183,7 +211,8 @@ class HostFunction:
 
     def __call__(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
         """Return the result of a call, traced or not."""
-        if self._native and jax.default_backend() == "cpu":
+        if self.native and jax.default_backend() == "cpu":
+            _used.append(self._name)
             return jax.ffi.ffi_call(self._name, result, vmap_method="expand_dims")(*operands)
         rank = operands[0].ndim
 

@@ -1,9 +1,10 @@
-"""Rotations: the polar factor of a matrix, and quaternions."""
+"""Rotations: the polar factor, rotation vectors and quaternions."""
 
 from functools import reduce
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdeform._linalg.small_matrices import (
@@ -170,3 +171,27 @@ def quaternion_product(
         ],
         axis=1,
     )
+
+
+def rotation_matrices(
+    vectors: Float[Array, "rotations 3"] | Float[np.ndarray, "rotations 3"],
+) -> Float[Array, "rotations 3 3"] | Float[np.ndarray, "rotations 3 3"]:
+    """Return Rodrigues' rotation of each vector: its direction is the axis, its length the angle.
+
+    Series near the zero angle, so that derivatives exist there. NumPy's arrays give NumPy's,
+    JAX's give JAX's.
+    """
+    xp = jnp if isinstance(vectors, jax.Array) else np
+    square = xp.sum(vectors**2, axis=1)
+    small = square < 1e-8
+    safe = xp.where(small, 1.0, square)
+    angle = xp.sqrt(safe)
+    sine = xp.where(small, 1.0 - square / 6.0, xp.sin(angle) / angle)
+    # 1 - cos by the half angle, which loses no digits.
+    cosine = xp.where(small, 0.5 - square / 24.0, 2.0 * xp.sin(angle / 2.0) ** 2 / safe)
+    x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
+    zero = xp.zeros_like(x)
+    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
+    cross = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    eye = xp.eye(3, dtype=vectors.dtype)[None]
+    return eye + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross)

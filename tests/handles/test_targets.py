@@ -1,8 +1,5 @@
-"""Generated meshes against what makes a good mesh, motions against scipy's rotations."""
+"""Makers of targets against SciPy's rotations, in NumPy and in JAX."""
 
-from functools import partial
-
-import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,89 +8,6 @@ from helpers import EXACT, FD, ends
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
-
-CLOSED = {
-    "bar": jd.shapes.bar,
-    "cylinder": jd.shapes.cylinder,
-    "cactus": jd.shapes.cactus,
-    # The default, 50,298 vertices, takes 12 s.
-    "octopus": partial(jd.shapes.octopus, 6000),
-}
-
-
-@pytest.fixture(params=CLOSED, scope="module")
-def closed(request):
-    return request.param, CLOSED[request.param]()
-
-
-def test_sizes(closed):
-    name, mesh = closed
-    if name == "bar":
-        assert (mesh.n_vertices, mesh.n_faces) == (722, 1440)
-        np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [30, 151, 30], rtol=EXACT)
-        assert mesh.vertices[:, 1].min() == 0
-    elif name == "cylinder":
-        assert (mesh.n_vertices, mesh.n_faces) == (4802, 9600)
-        assert np.bincount(mesh.edges.ravel()).max() == 40
-    elif name == "cactus":
-        assert abs(mesh.n_vertices / 5300 - 1) < 0.05
-    else:
-        assert abs(mesh.n_vertices / 6000 - 1) < 0.05
-
-
-def test_closed_manifold_and_outward(closed):
-    _, mesh = closed
-    v, f = mesh.vertices, np.asarray(mesh.faces)
-    directed = {(int(face[i]), int(face[(i + 1) % 3])) for face in f for i in range(3)}
-    # Every directed edge once, and its reverse too: closed, manifold edges, oriented alike.
-    assert len(directed) == 3 * len(f)
-    assert directed == {(j, i) for i, j in directed}
-    assert igl.is_vertex_manifold(f).all()
-    assert len(np.unique(f)) == len(v)
-    components = igl.connected_components(igl.adjacency_matrix(f))
-    assert components[0] == 1
-    assert len(v) - len(mesh.edges) + len(f) == 2
-    box = np.prod(np.ptp(v, axis=0))
-    assert 0.02 * box < volume(mesh) <= box * (1 + EXACT)
-
-
-def test_no_slivers(closed):
-    """A cap of 40 narrow triangles at each pole of the cylinder, 9 degrees, is part of it."""
-    name, mesh = closed
-    angles = np.degrees(igl.internal_angles(mesh.vertices, np.asarray(mesh.faces)))
-    assert angles.min() > {"bar": 40, "cylinder": 8}.get(name, 15)
-    assert angles.max() < 150
-
-
-def volume(mesh):
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-
-
-def test_volumes_are_those_of_the_solids():
-    np.testing.assert_allclose(volume(jd.shapes.bar()), 30 * 151 * 30, rtol=EXACT)
-    prism = 40 / 2 * np.sin(2 * np.pi / 40) * 12  # a 40-gon of radius 1, 12 high
-    np.testing.assert_allclose(volume(jd.shapes.cylinder()), prism, rtol=EXACT)
-
-
-def test_square_is_fig_4_1():
-    mesh = jd.shapes.square()
-    assert sorted(map(tuple, mesh.vertices)) == [
-        (x, y, 0.0) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)
-    ]
-    assert mesh.vertices[4].tolist() == [0, 0, 0]
-    corner = mesh.vertices[mesh.faces]
-    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    np.testing.assert_allclose(normals, np.broadcast_to([0, 0, 1.0], (8, 3)), atol=EXACT)
-
-
-@pytest.mark.parametrize("count", [4999, 0, -1, 5000.5, "6000", True])
-def test_octopus_of_a_bad_size(count):
-    with pytest.raises(jd.InputError, match="octopus"):
-        jd.shapes.octopus(count)
-
-
-# ---------------------------------------------------------------- motions
 
 POINTS = np.random.default_rng(0).normal(size=(12, 3))
 CENTER = np.array([0.3, -2.0, 1.0])
@@ -173,6 +87,71 @@ def test_single_precision_stays_single_and_integers_become_floats():
     assert jd.rotate([[1, 0, 0], [0, 1, 0]], 90).dtype == jnp.float64
 
 
+MOTIONS = {
+    "translate": lambda points: jd.translate(points, CENTER),
+    "rotate": lambda points: jd.rotate(points, 33.0, axis=[1, -2, 0.5]),
+    "rotate about": lambda points: jd.rotate(points, 33.0, axis="x", center=CENTER),
+    "twist": lambda points: jd.twist(points, -50.0, along="z"),
+    "bend": lambda points: jd.bend(points, 120.0, along="x", toward="z"),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_numpy_and_jax_give_the_same_in_their_own_arrays(name):
+    host, device = MOTIONS[name](POINTS), MOTIONS[name](jnp.asarray(POINTS))
+    assert isinstance(host, np.ndarray)
+    assert isinstance(device, jax.Array)
+    assert isinstance(MOTIONS[name](POINTS.tolist()), np.ndarray)
+    np.testing.assert_allclose(host, device, atol=1e-12)
+    low = MOTIONS[name](POINTS.astype(np.float32))
+    assert low.dtype == np.float32
+    np.testing.assert_allclose(low, host, atol=1e-5)  # 100 eps
+
+
+def test_a_jax_motion_makes_the_result_jaxs():
+    angle = jnp.asarray(9.0)
+    for found in (
+        jd.rotate(POINTS, angle),
+        jd.bend(POINTS, angle),
+        jd.twist(POINTS, angle),
+        jd.translate(POINTS, jnp.asarray(CENTER)),
+        jd.rotate(POINTS, 9.0, center=jnp.asarray(CENTER)),
+    ):
+        assert isinstance(found, jax.Array)
+
+
+@pytest.mark.parametrize("kind", [">f8", ">f4", np.longdouble, np.float16, np.int8, np.uint64])
+def test_every_type_of_number_is_taken(kind):
+    whole = np.round(POINTS + 5)
+    found = jd.bend(whole.astype(kind), 90.0)
+    assert found.dtype in (np.float32, np.float64)
+    assert found.dtype.isnative
+    np.testing.assert_allclose(found, jd.bend(whole, 90.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [1e308, 1e-200, 5e-324])
+def test_an_axis_may_have_any_length(size):
+    want = Rotation.from_rotvec(np.radians(77.0) * np.array([1, 1, 0]) / np.sqrt(2))
+    for points in (POINTS, jnp.asarray(POINTS)):
+        found = jd.rotate(points, 77.0, axis=[size, size, 0], center=np.zeros(3))
+        np.testing.assert_allclose(found, want.apply(POINTS), atol=EXACT)
+
+
+def test_whole_turns_change_nothing():
+    for points in (POINTS, jnp.asarray(POINTS)):
+        found = jd.rotate(points, 360.0 * 1e6 + 90.0)
+        np.testing.assert_allclose(found, jd.rotate(POINTS, 90.0), atol=EXACT)
+
+
+def test_bend_along_a_vector_is_the_bend_of_rotated_points():
+    turn = Rotation.from_rotvec([0.3, -0.8, 1.1])
+    # Two points, so that the middle of their extent does not depend on the frame.
+    points = np.array([[0.2, -3.0, 0.1], [-0.4, 2.0, 0.7]])
+    along, toward = turn.apply([0, 2.0, 0]), turn.apply([3.0, 0, 0])
+    found = jd.bend(turn.apply(points), 40.0, along=along, toward=toward)
+    np.testing.assert_allclose(found, turn.apply(jd.bend(points, 40.0)), atol=EXACT)
+
+
 def test_bad_arguments_are_named():
     bad = {
         r"points have shape \(3,\)": lambda: jd.rotate([1.0, 2, 3], 9.0),
@@ -180,11 +159,26 @@ def test_bad_arguments_are_named():
         "points are of type": lambda: jd.twist([["a", "b", "c"]]),
         "axis 'w': give": lambda: jd.rotate(POINTS, 9.0, axis="w"),
         "axis 'xy': give": lambda: jd.twist(POINTS, along="xy"),
-        r"axis \[0.0, 0.0, 0.0\]": lambda: jd.rotate(POINTS, 9.0, axis=[0, 0, 0]),
+        r"axis \[0, 0, 0\]": lambda: jd.rotate(POINTS, 9.0, axis=[0, 0, 0]),
         r"axis \[nan": lambda: jd.rotate(POINTS, 9.0, axis=[np.nan, 0, 0]),
-        "along and toward are both 'z'": lambda: jd.bend(POINTS, along="z", toward="z"),
+        "along is 'z' and toward 'z'": lambda: jd.bend(POINTS, along="z", toward="z"),
         r"center has shape \(2,\): give \(3,\)": lambda: jd.rotate(POINTS, 9.0, center=[0.0, 1.0]),
         r"degrees has shape \(2,\)": lambda: jd.bend(POINTS, [9.0, 8.0]),
+        r"axis \[inf": lambda: jd.rotate(POINTS, 9.0, axis=[np.inf, 0, 0]),
+        "axis None": lambda: jd.rotate(POINTS, 9.0, axis=None),
+        r"axis \[1, 2\]": lambda: jd.rotate(POINTS, 9.0, axis=[1, 2]),
+        "degrees cannot be read": lambda: jd.rotate(POINTS, "many"),
+        "axis is traced": lambda: jax.jit(lambda a: jd.rotate(POINTS, 9.0, axis=a))(CENTER),
+        "degrees is 1e\\+300": lambda: jd.bend(POINTS, 1e300),
+        "degrees is nan": lambda: jd.twist(jnp.asarray(POINTS), np.nan),
+        "degrees is None": lambda: jd.twist(POINTS, None),
+        "points cannot be read": lambda: jd.twist([[1.0, 2.0], [1.0]]),
+        r"point 1 is \[0.0, nan, 0.0\]": lambda: jd.bend([[0, 0, 0], [0, np.nan, 0]]),
+        r"point 0 is \[inf": lambda: jd.bend(jnp.full((2, 3), np.inf)),
+        "points overflow": lambda: jd.translate([[1e308, 0, 0]], [1e308, 0, 0]),
+        "moved points overflow": lambda: jd.twist([[1e308, 0, 0], [1e308, 1e308, 0]]),
+        r"offset is \[nan": lambda: jd.translate(POINTS, [np.nan, 0, 0]),
+        "center is": lambda: jd.rotate(POINTS, 9.0, center=[np.inf, 0, 0]),
         r"offset has shape \(2,\): give \(3,\) or \(12, 3\)": lambda: jd.translate(POINTS, [1, 2]),
     }
     for message, call in bad.items():
