@@ -1,7 +1,8 @@
-"""Pictures of meshes, without a display (needs the ``viewer`` extra)."""
+"""Pictures of meshes, drawn without a display. They need the extra ``viewer``."""
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,19 +25,21 @@ def render(
     label: str = "rigidity",
     width: int = 500,
 ) -> None:
-    """Draw poses of a mesh side by side, all to one scale, into a PNG file.
+    """Draw poses of a mesh side by side, all at the same scale, into a PNG file.
 
     **Arguments**
 
-    - path: a ``.png`` file; replaced whole or not at all.
+    - path: a ``.png`` file; replaced as a whole or not at all.
     - mesh: gives the faces.
-    - poses: a list of vertices (n, 3).
+    - poses: a list of positions (vertices, 3).
     - titles: one text per pose.
-    - values: one array (n,) per pose, or None, shown as colour (logarithmic where positive).
-    - label: what the values are.
-    - width: of each view, in pixels.
+    - values: for each pose an array (vertices,), a number, or None; shown as colour, on a
+      logarithmic scale if all are positive and they differ by more than a factor of 5.
+    - label: the name of the values.
+    - width: the width of each view, in pixels.
 
-    **Raises** InputError: no PNG name, or pyvista is not installed.
+    **Raises** InputError: the name does not end in .png; the folder cannot be written; pyvista is
+    not installed.
 
     Example:
         >>> import jaxdeform as jd, pathlib, tempfile
@@ -48,53 +51,57 @@ def render(
     """
     path = Path(path)
     check_picture_path(path)
-    import pyvista  # slow to import, and only needed here
+    import pyvista  # slow to import, and needed only here
     from vtkmodules.vtkCommonCore import vtkLogger
 
-    # Without a display VTK falls back to drawing in memory, which is all we want: no warning.
+    # Without a display VTK falls back to drawing in memory, which is what we want: no warning.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
     arrays = [np.asarray(pose, np.float64) for pose in poses]
-    shown = [v for v in values if v is not None]
-    limits = (min(map(np.min, shown)), max(map(np.max, shown))) if shown else (0.0, 1.0)
-    logarithmic = limits[0] > 0 and limits[1] > 5 * limits[0]
     plotter = pyvista.Plotter(
         shape=(1, len(arrays)), window_size=[width * len(arrays), int(1.3 * width)], off_screen=True
     )
+    shown = [v for v in values if v is not None]
     for k, pose in enumerate(arrays):
         plotter.subplot(0, k)
-        surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
         color = values[k] if k < len(values) else None
         options: dict[str, Any] = {"color": "lightsteelblue"}
         if color is not None:
-            options = {
-                "scalars": np.broadcast_to(np.asarray(color, np.float64), len(pose)),
-                "clim": limits if limits[1] > limits[0] else (limits[0], limits[0] + 1),
-                "log_scale": bool(logarithmic),
-                "cmap": "viridis",
-                "scalar_bar_args": {"title": label},
-            }
+            scalars = np.broadcast_to(np.asarray(color, np.float64), len(pose))
+            options = {"scalars": scalars, **_color_scale(shown, label)}
+        surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
         plotter.add_mesh(surface, show_edges=mesh.n_faces < 5000, line_width=0.5, **options)
         if k < len(titles):
             plotter.add_text(titles[k], font_size=10)
-    # Seen against the direction in which all poses together are thinnest.
+    # Look along the direction in which all poses together are thinnest.
     together = np.concatenate(arrays)
     plotter.link_views()
     plotter.camera_position = _camera(together)
-    # pyvista's decorator hides self from pyright.
+    # The decorator of pyvista hides self from pyright.
     plotter.reset_camera(bounds=_bounds(together))  # pyright: ignore[reportCallIssue]
     image = np.asarray(plotter.screenshot(return_img=True))
     plotter.close()
+    write_atomically(path, partial(_write_png, image))
 
-    def write(name: str) -> None:
-        from PIL import Image  # comes with pyvista
 
-        Image.fromarray(image).save(name, format="PNG")
+def _color_scale(shown: Sequence[ArrayLike], label: str) -> dict[str, Any]:
+    """Return the options of pyvista that all poses share, so that colours can be compared."""
+    low, high = (min(map(np.min, shown)), max(map(np.max, shown))) if shown else (0.0, 1.0)
+    return {
+        "clim": (low, high) if high > low else (low, low + 1),
+        "log_scale": bool(low > 0 and high > 5 * low),
+        "cmap": "viridis",
+        "scalar_bar_args": {"title": label},
+    }
 
-    write_atomically(path, write)
+
+def _write_png(image: np.ndarray, name: str) -> None:
+    from PIL import Image  # comes with pyvista
+
+    Image.fromarray(image).save(name, format="PNG")
 
 
 def check_picture_path(path: Path) -> None:
-    """Raise InputError if no picture could be written there."""
+    """Raise InputError if no picture can be written at this path."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: pictures are PNG files: use a .png name")
     if find_spec("pyvista") is None:
@@ -102,17 +109,17 @@ def check_picture_path(path: Path) -> None:
     check_place(path)
 
 
-def _camera(points: Float[np.ndarray, "n 3"]):
+def _camera(points: Float[np.ndarray, "points 3"]):
     extent = np.ptp(points, axis=0)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     thin, up = int(np.argmin(extent)), int(np.argmax(extent))
     if extent[1] > 0.8 * extent[up] and thin != 1:
-        up = 1  # most meshes stand along y
+        up = 1  # most meshes stand upright along y
     direction = np.full(3, 0.35)
     direction[thin], direction[up] = 1.0, 0.25
     return [middle + 3 * np.linalg.norm(extent) * direction, middle, np.eye(3)[up]]
 
 
-def _bounds(points: Float[np.ndarray, "n 3"]) -> list[float]:
+def _bounds(points: Float[np.ndarray, "points 3"]) -> list[float]:
     low, high = points.min(axis=0), points.max(axis=0)
     return [value for pair in zip(low, high, strict=True) for value in pair]

@@ -19,14 +19,11 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-# Files are read and written in double precision, so the command line computes in it.
-jax.config.update("jax_enable_x64", True)
-
-import jaxdeform as jd  # noqa: E402 (after x64)
-from jaxdeform._mesh.files import check_output, check_place, write_atomically  # noqa: E402
-from jaxdeform.checks import check_rigidity  # noqa: E402
-from jaxdeform.estimation import check_parts  # noqa: E402
-from jaxdeform.plotting import check_picture_path  # noqa: E402
+import jaxdeform as jd
+from jaxdeform._mesh.files import check_output, check_place, write_atomically
+from jaxdeform.checks import check_rigidity
+from jaxdeform.estimation import check_parts
+from jaxdeform.plotting import check_picture_path
 
 app = typer.Typer(
     help="Deform triangle meshes whose parts differ in rigidity.",
@@ -34,22 +31,28 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-# File names are printed as they are: no markup in brackets, no line breaks.
+# Print file names unchanged: brackets are not markup, and lines are not wrapped.
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
 Out = TypeVar("Out")
 
 
 class _Interrupted(BaseException):
-    """Ctrl-C. (Typer would take a KeyboardInterrupt for itself.)"""
+    """Ctrl-C. (Typer would handle a KeyboardInterrupt itself.)"""
 
 
 def _interrupt(*_) -> None:
     raise _Interrupted
 
 
+@app.callback()
+def compute_in_double_precision() -> None:
+    """Turn on float64 before a command runs, because files are read and written in float64."""
+    jax.config.update("jax_enable_x64", True)
+
+
 def main() -> None:
-    """Run the command line; an InputError is one line on standard error, and exit code 2."""
+    """Run the command line. An InputError becomes one line on standard error and exit code 2."""
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
@@ -57,15 +60,18 @@ def main() -> None:
         print(f"jaxdeform: {error}", file=sys.stderr)
         sys.exit(2)
     except _Interrupted:
-        print("jaxdeform: interrupted; files that were there are whole", file=sys.stderr)
+        print("jaxdeform: interrupted; no file was left half-written", file=sys.stderr)
         sys.stderr.flush()
-        os._exit(130)  # whatever is still computing beside
+        os._exit(130)  # do not wait for the worker thread
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def _patiently(what: str, work: Callable[[], Out]) -> Out:
-    """Run work in another thread, showing how long: while JAX computes, no one hears Ctrl-C."""
+    """Run work in another thread and show how long it takes.
+
+    While JAX computes, its thread does not receive Ctrl-C; the main thread, which waits, does.
+    """
     outcome: Future[Out] = Future()
 
     def run() -> None:
@@ -87,7 +93,7 @@ def _patiently(what: str, work: Callable[[], Out]) -> Out:
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("out"),
 ) -> None:
-    """Bend a bar of two materials and write the deformed meshes and a picture."""
+    """Bend a bar of soft, stiff and mixed material; write the deformed meshes and a picture."""
     _make_folder(out)
     check_picture_path(out / "demo.png")
     mesh = jd.shapes.bar()
@@ -130,48 +136,54 @@ def demo(
 
 @app.command()
 def inspect(mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file.")]) -> None:
-    """Say what is wrong or unusual with a mesh."""
+    """Report what is wrong or unusual with a mesh."""
     console.print(str(jd.inspect(mesh)))
 
 
 @app.command()
 def deform(
     mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write the result to.")],
-    handles: Annotated[Path, typer.Option(help="Handle file: .json, or .sel beside a .def.")],
-    rigidity: Annotated[
-        str, typer.Option(help="A number, or a PLY file with a rigidity per vertex.")
+    out: Annotated[Path, typer.Option("--out", "-o", help="Mesh file to write.")],
+    handles: Annotated[
+        Path, typer.Option(help="Handle file: .json, or .sel with a .def of the same name.")
     ],
-    rings: Annotated[int, typer.Option(min=1, help="Size of the neighbourhoods.")] = 1,
+    rigidity: Annotated[
+        str, typer.Option(help="A number, or a PLY file with one rigidity per vertex.")
+    ],
+    rings: Annotated[int, typer.Option(min=1, help="Size of the cells, in rings of vertices.")] = 1,
     steps: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="This many alternating steps; to convergence if left out (100 with --normals).",
+            help="Number of alternating steps. By default, until convergence (100 with --normals).",
         ),
     ] = None,
     normals: Annotated[bool, typer.Option(help="Add the normal term (Eq. 4.7).")] = False,
-    motion: Annotated[Path | None, typer.Option(help=".def file of a .sel handle file.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG of the rest and the result.")] = None,
+    motion: Annotated[
+        Path | None, typer.Option(help="The .def file of a .sel handle file.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG file for a picture of both shapes.")
+    ] = None,
 ) -> None:
-    """Move the handles of a mesh and let the rest follow."""
+    """Move the handles of a mesh; the rest of it follows."""
     shape = jd.load_mesh(mesh)
-    # Whatever can be wrong is found before the long work.
+    # Check all arguments before the long work.
     check_output(out)
     if picture is not None:
         check_picture_path(picture)
-    held = jd.load_handles(handles, shape, motion)
+    moves = jd.load_handles(handles, shape, motion)
     values = _rigidity(rigidity, shape)
     began = time.perf_counter()
     problem = _patiently(
-        "precomputing", lambda: jd.precompute(shape, held.handles, cells=jd.rings(shape, rings))
+        "precomputing", lambda: jd.precompute(shape, moves.handles, cells=jd.rings(shape, rings))
     )
-    console.print(f"{shape}, {len(held.handles)} handles: precomputed in {_since(began)}")
+    console.print(f"{shape}, {len(moves.handles)} handles: precomputed in {_since(began)}")
     began = time.perf_counter()
     solver = None if steps is None else jd.Alternating(steps)
     solution = _patiently(
         "deforming",
-        lambda: jd.deform(problem, held.targets, values, solver=solver, normals=normals),
+        lambda: jd.deform(problem, moves.targets, values, solver=solver, normals=normals),
     )
     energy, done = float(solution.energy[-1]), int(solution.steps)
     console.print(f"energy {energy:.6g} after {done} steps in {_since(began)}")
@@ -192,25 +204,26 @@ def estimate(
     poses: Annotated[list[Path], typer.Argument(help="Deformed meshes with the same faces.")],
     out: Annotated[Path, typer.Option("--out", "-o", help=".ply file for the rigidity.")],
     handles: Annotated[
-        Path | None, typer.Option(help="Handle file; what moved rigidly if left out.")
+        Path | None, typer.Option(help="Handle file. By default, the vertices that moved rigidly.")
     ] = None,
     parts: Annotated[
-        Path | None, typer.Option(help="The part of each vertex from 0: a number a line, or .json.")
+        Path | None,
+        typer.Option(help="The part of each vertex, from 0: one number per line, or .json."),
     ] = None,
     tolerance: Annotated[
         float,
         typer.Option(
-            help="For finding handles: how exactly they moved rigidly, as a part of "
-            "the bounding box diagonal."
+            help="How exactly handles must have moved rigidly to be found, as a fraction of the "
+            "bounding box diagonal."
         ),
     ] = 1e-6,
-    rings: Annotated[int, typer.Option(min=1, help="Size of the neighbourhoods.")] = 1,
+    rings: Annotated[int, typer.Option(min=1, help="Size of the cells, in rings of vertices.")] = 1,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="This many alternating steps; to convergence if left out."),
+        typer.Option(min=1, help="Number of alternating steps. By default, until convergence."),
     ] = None,
 ) -> None:
-    """Estimate how rigid a mesh or its parts are, from deformed poses."""
+    """Estimate the rigidity of a mesh or of its parts from deformed poses."""
     shape = jd.load_mesh(rest)
     check_output(out)
     report = out.with_suffix(".json")
@@ -220,46 +233,56 @@ def estimate(
     observed = np.stack([_pose(path, shape, rest) for path in poses])
     label = np.zeros(shape.n_vertices, int) if parts is None else _parts(parts, shape)
     if handles is None:
-        groups = jd.find_handle_groups(shape, observed, tolerance=tolerance)
-        held = np.unique(np.concatenate([group.vertices for group in groups]))
-        sizes = ", ".join(str(len(group.vertices)) for group in groups[:10])
-        more = ", ..." if len(groups) > 10 else ""
-        console.print(f"{len(groups)} groups of vertices moved rigidly ({sizes}{more}): handles")
+        index = _moved_rigidly(shape, observed, tolerance)
     else:
-        held = jd.load_handles(handles, shape).handles
-    solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
+        index = jd.load_handles(handles, shape).handles
     began = time.perf_counter()
     problem = _patiently(
-        "precomputing", lambda: jd.precompute(shape, held, cells=jd.rings(shape, rings))
+        "precomputing", lambda: jd.precompute(shape, index, cells=jd.rings(shape, rings))
     )
-
-    def show(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
-        values = ", ".join(f"{value:.3g}" for value in rigidity[:5])
-        console.print(f"evaluation {evaluation}: misfit {misfit:.4g}, rigidity {values}")
-
+    solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
     fit = _patiently(
         "estimating",
-        lambda: jd.estimate_rigidity(problem, observed, parts=label, solver=solver, progress=show),
+        lambda: jd.estimate_rigidity(
+            problem, observed, parts=label, solver=solver, progress=_show_evaluation
+        ),
     )
+    console.print(_part_table(fit, label))
+    console.print(f"misfit {fit.misfit:.4g} after {len(fit.history)} evaluations, {_since(began)}")
+    console.print(str(fit.result))
+    jd.save_mesh(out, shape, rigidity=fit.field)
+    text = json.dumps(_as_json(fit, index), indent=1, allow_nan=False)
+    write_atomically(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
+    console.print(f"wrote {out} and {report}")
+
+
+def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.ndarray:
+    groups = jd.find_handle_groups(mesh, observed, tolerance=tolerance)
+    sizes = ", ".join(str(len(group.vertices)) for group in groups[:10])
+    more = ", ..." if len(groups) > 10 else ""
+    console.print(f"handles: {len(groups)} groups of vertices moved rigidly ({sizes}{more})")
+    return np.unique(np.concatenate([group.vertices for group in groups]))
+
+
+def _show_evaluation(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
+    values = ", ".join(f"{value:.3g}" for value in rigidity[:5])
+    console.print(f"evaluation {evaluation}: misfit {misfit:.4g}, rigidity {values}")
+
+
+def _part_table(fit: jd.Estimate, label: np.ndarray) -> Table:
     table = Table("part", "vertices", "rigidity", "95 % interval", "verdict")
     for k, (value, (low, high)) in enumerate(zip(fit.rigidity, fit.interval, strict=True)):
         size = str(int((label == k).sum()))
         table.add_row(str(k), size, f"{value:.4g}", f"{low:.4g} to {high:.4g}", fit.verdict[k])
-    console.print(table)
-    console.print(f"misfit {fit.misfit:.4g} after {len(fit.history)} evaluations, {_since(began)}")
-    console.print(str(fit.result))
-    jd.save_mesh(out, shape, rigidity=fit.field)
-    text = json.dumps(_as_json(fit, held), indent=1, allow_nan=False)
-    write_atomically(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
-    console.print(f"wrote {out} and {report}")
+    return table
 
 
 def _pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:
     pose = jd.load_mesh(path)
     if pose.n_vertices != rest.n_vertices or not np.array_equal(pose.faces, rest.faces):
         raise jd.InputError(
-            f"{path}: is no pose of {name}: {pose} and {rest} must have the same vertices and "
-            "faces in the same order"
+            f"{path}: is not a pose of {name}: {pose} and {rest} must have the same vertices and "
+            "faces, in the same order"
         )
     return pose.vertices
 
@@ -271,7 +294,7 @@ def _parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
         label = np.array([int(value) for value in values])
     except (OSError, ValueError, TypeError) as error:
         raise jd.InputError(
-            f"{path}: cannot be read as one integer per vertex ({error})"
+            f"{path}: cannot be read as one integer per vertex ({error}): give a number per line"
         ) from error
     try:
         return check_parts(label, mesh.n_vertices)
@@ -280,7 +303,7 @@ def _parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
 
 
 def _as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
-    """Return what the estimate says; null stands for infinity, which JSON has not."""
+    """Return the content of the report. JSON has no infinity, so null stands for it."""
     finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
     return {
         "parts": [
@@ -300,7 +323,7 @@ def _rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     except ValueError:
         if not Path(text).exists():
             raise jd.InputError(
-                f"--rigidity {text}: is neither a number nor the name of a PLY file that is there"
+                f"--rigidity {text}: is neither a number nor a file: give a number or a PLY file"
             ) from None
         values = jd.load_rigidity(text)
     try:
@@ -314,7 +337,9 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise jd.InputError(f"{folder}: cannot be made ({error.strerror})") from error
+        raise jd.InputError(
+            f"{folder}: cannot be made ({error.strerror}): choose another folder"
+        ) from error
 
 
 def _since(began: float) -> str:

@@ -58,19 +58,19 @@ def cross(u: list[Array], v: list[Array]) -> list[Array]:
 
 
 class LDL(NamedTuple):
-    """A symmetric matrix as L D L^T, entry by entry."""
+    """The factors of symmetric matrices ``L D L^T``, by components."""
 
     lower: list[list[Array]]
-    """L below its diagonal of ones; nothing on and above it is read."""
+    """L, of which only the entries below the unit diagonal are read."""
     diagonal: list[Array]
 
 
 def ldl_factor(matrix: list[list[Array]], floor: Array) -> LDL:
-    """Factor symmetric matrices, unrolled into scalars; only their lower halves are read.
+    """Factor symmetric matrices, unrolled into components; only their lower halves are read.
 
-    A pivot below ``floor`` (a direction without stiffness) is replaced by it. With 9x9 matrices
-    this and one solve take 13 ms for 51,200 cells; vmapped ``jnp.linalg.solve`` takes four times as
-    long.
+    A pivot below ``floor`` (a direction without stiffness) is replaced by ``floor``. For 9x9
+    matrices and 51,200 cells, this and one solve take 13 ms; a vmapped ``jnp.linalg.solve`` takes
+    four times as long.
     """
     size = len(matrix)
     lower: list[list[Array]] = [[matrix[0][0]] * size for _ in range(size)]
@@ -86,7 +86,7 @@ def ldl_factor(matrix: list[list[Array]], floor: Array) -> LDL:
 
 
 def ldl_solve(factor: LDL, right: list[Array]) -> list[Array]:
-    """Solve with a factored matrix."""
+    """Solve for one right-hand side with factored matrices."""
     lower, diagonal = factor
     size, y = len(right), list(right)
     for i in range(size):

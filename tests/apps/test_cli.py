@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -226,6 +227,26 @@ def test_a_folder_that_cannot_be_made(run, files):
     assert err.startswith(f"jaxdeform: {files}/bar.off/x: cannot be made")
 
 
+def test_importing_the_command_line_does_not_turn_on_float64():
+    code = "import jax, jaxdeform._apps.cli; print(jax.config.jax_enable_x64)"
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "False\n"
+
+
+def test_commands_compute_in_float64(run, files, monkeypatch):
+    seen = []
+    monkeypatch.setattr(jd, "inspect", lambda _: seen.append(jax.config.jax_enable_x64))
+    jax.config.update("jax_enable_x64", False)
+    try:
+        assert run("inspect", files / "bar.off")[0] == 0
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert seen == [True]
+
+
 def test_ctrl_c_leaves_old_files_whole(files):
     (files / "out.ply").write_text("old")
     before = sorted(os.listdir(files))
@@ -241,6 +262,6 @@ def test_ctrl_c_leaves_old_files_whole(files):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert err == "jaxdeform: interrupted; files that were there are whole\n"
+    assert err == "jaxdeform: interrupted; no file was left half-written\n"
     assert (files / "out.ply").read_text() == "old"
     assert sorted(os.listdir(files)) == before
