@@ -47,6 +47,16 @@ class Solution(eqx.Module):
         """True if it converged, or ran the number of steps that was asked for."""
         return (self.result == Result.converged) | (self.result == Result.steps_done)
 
+    def explain(self) -> str:
+        """Return what happened in words, with the first cells that have no finite transformation.
+
+        Of one solution, not of a batch, and once the values are known.
+        """
+        bad = np.flatnonzero(~np.isfinite(np.asarray(self.transforms)).all(axis=(1, 2)))
+        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
+        where = f" These are {len(bad)} of {len(self.transforms)} cells: {shown}."
+        return Result[self.result] + (where if bad.size else "")
+
 
 def deform(
     problem: Problem,
