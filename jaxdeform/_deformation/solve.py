@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.energy import local_energy
-from jaxdeform._deformation.local_step import LocalStep, Newton, check_local_step
+from jaxdeform._deformation.local_step import LocalStep, Newton
+from jaxdeform._deformation.local_step_check import check_local_step
 from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
