@@ -19,7 +19,8 @@ class Result(eqx.Enumeration):
         "allow more steps (or loosen the tolerance) if you rely on derivatives."
     )
     not_finite = (
-        "Not finite: the numbers overflowed, or a local step failed. See which cells of "
-        "`transforms` are not finite, check the scale of the targets and of the rigidity (its unit "
-        "is length squared), try the default local step, or use float64."
+        "Not finite: a local step failed, or the numbers overflowed. The cells at fault are those "
+        "whose `transforms` are not finite (`Solution.explain` names them). Try the default local "
+        "step, float64, or another scale of the targets and the rigidity (its unit is length "
+        "squared)."
     )

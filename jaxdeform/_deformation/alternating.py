@@ -62,7 +62,9 @@ class Alternating:
             # Kept for the backward pass: one p a step. All else is computed again there.
             at = energy.evaluate(system, inputs, p)
             move = system.factor.solve(at.gradient)
-            done = is_last
+            # A cell without a solution would spread to all others. So the last finite p stays, and
+            # only such cells have transforms that are NaN.
+            done = is_last | jnp.isnan(at.energy)
             if self.tolerance is not None:
                 gain = jnp.sum(at.gradient * move)
                 done |= has_converged(gain, at.energy, at.rounding, self.tolerance)

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.energy import local_energy
-from jaxdeform._deformation.local_step import LocalStep, Newton, check_local_step
+from jaxdeform._deformation.local_step import LocalStep, Newton
+from jaxdeform._deformation.local_step_check import check_local_step
 from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
@@ -46,6 +47,16 @@ class Solution(eqx.Module):
     def ok(self) -> Bool[Array, "*batch"]:
         """True if it converged, or ran the number of steps that was asked for."""
         return (self.result == Result.converged) | (self.result == Result.steps_done)
+
+    def explain(self) -> str:
+        """Return what happened in words, with the first cells that have no finite transformation.
+
+        Of one solution, not of a batch, and once the values are known.
+        """
+        bad = np.flatnonzero(~np.isfinite(np.asarray(self.transforms)).all(axis=(1, 2)))
+        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
+        where = f" These are {len(bad)} of {len(self.transforms)} cells: {shown}."
+        return Result[self.result] + (where if bad.size else "")
 
 
 def deform(

@@ -199,11 +199,9 @@ def _axis(axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
     if isinstance(axis, Tracer):
         raise InputError("the axis is traced by JAX: give its three numbers")
     try:
-        vector = np.asarray(axis if axis is not None else "None", np.float64)
+        vector = np.asarray(axis, np.float64)
     except (TypeError, ValueError):
-        raise InputError(
-            f"axis {axis!r}: give 'x', 'y', 'z' or a vector of three numbers"
-        ) from None
+        vector = np.empty(0)
     if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
         shown = axis.tolist() if isinstance(axis, np.ndarray | jax.Array) else axis
         raise InputError(f"axis {shown}: give 'x', 'y', 'z' or a vector (3,) that is not zero")

@@ -240,10 +240,13 @@ def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
     left = jnp.stack([step, dz, z], axis=1)
     products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
     first = work.iteration == 0
-    good = (new.energy <= work.at.energy + work.at.rounding) | first
+    plain = ~jnp.any(work.memory.filled, axis=1)
+    # Where even a plain step ends in NaN there is no way on. It is kept, so that it ends the member.
+    lost = plain & jnp.isnan(new.energy)
+    good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
     # A refused step costs its evaluation and clears the memory. The plain step that follows cannot
     # raise the energy, so a second refusal in a row is due to rounding.
-    stalled = work.stalled | (~good & ~jnp.any(work.memory.filled, axis=1))
+    stalled = work.stalled | (~good & plain)
     memory = _remember(work.memory, tick, good & ~first, good, step, dz, g, products)
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
     at = jax.tree.map(keep, new, work.at)
