@@ -57,6 +57,8 @@ from jaxdeform.estimation import (
 from jaxdeform.plotting import render
 from jaxdeform.result import Result
 
+__version__ = "0.1.0"  # pyproject.toml reads it from here
+
 __all__ = [
     "LBFGS",
     "Adjoint",

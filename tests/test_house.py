@@ -43,7 +43,7 @@ MODULES = sorted(FILES)
 def imported(path: Path) -> set[str]:
     """Return the modules of the package that a file imports, also inside functions."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxdeform"):
             inside = {f"{node.module}.{alias.name}" for alias in node.names}
             names |= {node.module} if node.module in FILES else inside
@@ -97,7 +97,7 @@ def test_examples_run(name):
     assert found.failed == 0
 
 
-README = (ROOT / "README.md").read_text()
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_readme_commands_name_what_is_there(name):
     assert (ROOT / words[words.index("--constraint") + 1]).exists()
     extras = re.search(r"\.\[([\w,]+)\]", line)
     assert extras
-    project = (ROOT / "pyproject.toml").read_text()
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     for extra in extras[1].split(","):
         assert re.search(rf"^{extra} = \[", project, re.MULTILINE)
     assert line.endswith({"demo": ".venv/bin/jaxdeform demo", "tests": "python -m pytest"}[name])
@@ -134,9 +134,13 @@ def test_readme_command_line_is_the_real_one():
         assert line.split()[1] in commands, line
 
 
+def test_citation_has_the_version_of_the_package():
+    (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert cited == jd.__version__
+
+
 def test_linked_files_are_there():
-    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
-    for page in pages:
-        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{page.name} links {target}"
