@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -21,7 +22,7 @@ from jaxdeform.errors import ArrayLike, InputError
 MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike
 
 
-def _arrays(mesh: object) -> tuple[ArrayLike, ArrayLike]:
+def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike]:
     if isinstance(mesh, Mesh):
         return mesh.vertices, mesh.faces
     if isinstance(mesh, str | os.PathLike):
