@@ -140,7 +140,7 @@ def _polygonise(cones: list[Cone], width: float, spacing: float) -> tuple[Points
     points, faces, _ = igl.marching_cubes(
         field.ravel()[used], np.ascontiguousarray(grid), index.reshape(-1, 8), 0.0
     )
-    return np.asarray(points), np.asarray(faces)
+    return np.asarray(points), np.asarray(faces).astype(np.int64)
 
 
 def _field_on_grid(axes, cones: list[Cone], width: float) -> Float[np.ndarray, "x y z"]:

@@ -13,7 +13,7 @@ from jaxdeform._deformation import local_step
 from jaxdeform._linalg.rotations import polar_rotation
 
 # Compiled once for each solver and number of cells; called plainly, every call compiles anew.
-fit = jax.jit(local_step.fit, static_argnums=0)
+fit = jax.jit(local_step.solve_local_step, static_argnums=0)
 
 
 def cells(strain, n=200, seed=0, flat=False):
