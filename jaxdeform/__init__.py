@@ -32,6 +32,10 @@ from jaxdeform._deformation.local_step import (
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
+from jaxdeform._estimation.field import FieldEstimate, estimate_rigidity_field
+from jaxdeform._estimation.parts import Estimate, estimate_rigidity
+from jaxdeform._estimation.rigid_groups import RigidGroup, find_handle_groups, find_handles
+from jaxdeform._estimation.thesis import ThesisEstimate, estimate_rigidity_thesis
 from jaxdeform._handles.files import HandleFile, load_handles
 from jaxdeform._handles.rigid import rigid_targets
 from jaxdeform._handles.targets import bend, rotate, translate, twist
@@ -43,17 +47,6 @@ from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.submesh import Submesh, submesh
 from jaxdeform.errors import InputError
-from jaxdeform.estimation import (
-    Estimate,
-    FieldEstimate,
-    RigidGroup,
-    ThesisEstimate,
-    estimate_rigidity,
-    estimate_rigidity_field,
-    estimate_rigidity_thesis,
-    find_handle_groups,
-    find_handles,
-)
 from jaxdeform.plotting import render
 from jaxdeform.result import Result
 

@@ -25,7 +25,7 @@ FLOORS = [
     ["_handles"],
     ["_deformation"],
     ["_baselines"],
-    ["estimation"],
+    ["_estimation"],
     ["plotting"],
     ["_apps"],
 ]

@@ -20,9 +20,9 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import jaxdeform as jd
+from jaxdeform._estimation.parts import check_parts
 from jaxdeform._mesh.files import check_output, check_place, write_atomically
 from jaxdeform.checks import check_rigidity
-from jaxdeform.estimation import check_parts
 from jaxdeform.plotting import check_picture_path
 
 app = typer.Typer(
