@@ -241,7 +241,7 @@ def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
     products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
     first = work.iteration == 0
     plain = ~jnp.any(work.memory.filled, axis=1)
-    # Where even a plain step ends in NaN there is no way on. It is kept, so that it ends the member.
+    # Where even a plain step ends in NaN there is no way on: it is kept, which ends the member.
     lost = plain & jnp.isnan(new.energy)
     good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
     # A refused step costs its evaluation and clears the memory. The plain step that follows cannot
