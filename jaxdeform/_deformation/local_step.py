@@ -17,7 +17,7 @@ against the alternatives in docs/benchmarks.md.
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -142,9 +142,9 @@ class LBFGS(_Material):
 
     Near a minimum energies differ by rounding alone, so a line search that compares them fails.
     jaxopt takes the step all the same, and learns a curvature from rounding errors: one cell in
-    3,000 ran off to 1e100 and became NaN. So here the line search allows for rounding, and a step
-    whose line search fails is refused. The cell goes on without memory; if that fails too, it is
-    done.
+    3,000 ran off to 1e100 and became NaN. So here the line search allows for rounding, steps
+    without positive curvature are not remembered, and a step whose line search fails is refused.
+    The cell goes on without memory; if that fails too, it is done.
     """
 
     tolerance: float = 1e-10
@@ -166,13 +166,20 @@ class LBFGS(_Material):
             maxls=30,  # down to 0.8^29 = 0.0015, less than one over the curvature
             implicit_diff=False,
         )
-        search = solver.linesearch_solver
-        search.tol = _energy_rounding(c, b, lam)  # pyright: ignore[reportAttributeAccessIssue]
+        # Of the energy alone: a step of 1 that is too short for Wolfe's condition is good here.
+        search: Any = solver.linesearch_solver
+        search.condition, search.tol = "armijo", _energy_rounding(c, b, lam)
         tolerance = max(self.tolerance, 16.0 * float(jnp.finfo(c.dtype).eps))
 
         def advance(state):
             step, t, last, _ = state
             after, new = solver.update(t, last, c, b, lam)
+            newest = last.iter_num % solver.history_size
+            curved = new.rho_history[newest] > 0
+            new = new._replace(
+                rho_history=jnp.where(curved, new.rho_history, new.rho_history.at[newest].set(0.0)),
+                gamma=jnp.where(curved, new.gamma, last.gamma),
+            )
             good = ~new.failed_linesearch & jnp.isfinite(new.error)
             had_memory = jnp.any(last.rho_history != 0)
             without_memory = last._replace(

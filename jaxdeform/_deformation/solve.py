@@ -55,7 +55,7 @@ class Solution(eqx.Module):
         """
         bad = np.flatnonzero(~np.isfinite(np.asarray(self.transforms)).all(axis=(1, 2)))
         shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
-        where = f" These are {len(bad)} of {len(self.transforms)} cells: {shown}."
+        where = f" Cells at fault: {shown} ({len(bad)} of {len(self.transforms)})."
         return Result[self.result] + (where if bad.size else "")
 
 
