@@ -12,7 +12,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The annotations of every module are checked at every call (typechecker.py).
 install_import_hook("jaxdeform", "typechecker.check")
 
-from helpers import ends  # noqa: E402
+from helpers import THESIS, ends  # noqa: E402
 
 import jaxdeform as jd  # noqa: E402 (after x64 and the hook)
 
@@ -37,3 +37,16 @@ def odd() -> jd.Mesh:
     """An open strip whose coordinates need all their bits."""
     v = np.random.default_rng(0).normal(size=(8, 3)) * [1e-7, 1.0, 1e7]
     return jd.Mesh(v, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6], [5, 7, 6]])
+
+
+@pytest.fixture(scope="session")
+def pose_of(bar_problem: jd.Problem, bar_targets: np.ndarray):
+    """Return poses of the bent bar by rigidity, compiled once."""
+    return lambda rigidity: np.asarray(
+        jd.deform(bar_problem, bar_targets, rigidity, solver=THESIS).vertices
+    )
+
+
+@pytest.fixture(scope="session")
+def halves(bar: jd.Mesh) -> np.ndarray:
+    return (bar.vertices[:, 1] > 75).astype(int)

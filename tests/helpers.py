@@ -19,6 +19,10 @@ REAL = Path(__file__).parents[2] / "shared" / "meshes"
 
 TWENTY = jd.Alternating(steps=20)
 TIGHT = jd.QuasiNewton(tolerance=1e-15)
+THESIS = jd.Alternating(steps=100)
+
+NOISE = 1e-4
+"""Of the bounding box diagonal, per coordinate."""
 
 BLENDS = [jd.linear_blend_skinning, jd.dual_quaternion_skinning]
 
@@ -98,3 +102,9 @@ def held_sheet():
     mesh = bumpy_sheet()
     handles = np.flatnonzero((mesh.vertices[:, 0] == 0) | (mesh.vertices[:, 0] == 7))
     return mesh, handles, np.asarray(jd.bend(mesh.vertices[handles], 60.0, along="x", toward="z"))
+
+
+def noisy(mesh: jd.Mesh, pose: np.ndarray, seed: int) -> np.ndarray:
+    """Return the pose with independent noise at every coordinate."""
+    draw = np.random.default_rng(seed).standard_normal(pose.shape)
+    return pose + NOISE * mesh.diagonal * draw

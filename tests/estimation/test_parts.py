@@ -8,7 +8,7 @@ import pytest
 from helpers import noisy
 
 import jaxdeform as jd
-from jaxdeform import cli
+from jaxdeform._apps import cli
 
 # ---------------------------------------------------------------- recovery
 
