@@ -32,6 +32,7 @@ from jaxdeform._deformation.local_step import (
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
+from jaxdeform._errors import InputError
 from jaxdeform._estimation.field import FieldEstimate, estimate_rigidity_field
 from jaxdeform._estimation.parts import Estimate, estimate_rigidity
 from jaxdeform._estimation.rigid_groups import RigidGroup, find_handle_groups, find_handles
@@ -46,9 +47,8 @@ from jaxdeform._mesh.inspection import Inspection, inspect, repair
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.submesh import Submesh, submesh
-from jaxdeform.errors import InputError
-from jaxdeform.plotting import render
-from jaxdeform.result import Result
+from jaxdeform._plotting import render
+from jaxdeform._result import Result
 
 __version__ = "0.1.0"  # pyproject.toml reads it from here
 

@@ -20,10 +20,10 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import jaxdeform as jd
+from jaxdeform._checks import check_rigidity
 from jaxdeform._estimation.parts import check_parts
 from jaxdeform._mesh.files import check_output, check_place, write_atomically
-from jaxdeform.checks import check_rigidity
-from jaxdeform.plotting import check_picture_path
+from jaxdeform._plotting import check_picture_path
 
 app = typer.Typer(
     help="Deform triangle meshes whose parts differ in rigidity.",

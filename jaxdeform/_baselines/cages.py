@@ -6,8 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import ArrayLike, InputError
 
 
 def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "vertices controls"]:

@@ -6,13 +6,13 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._checks import check_targets, split_handles
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.cells import spokes
 from jaxdeform._mesh.laplacian import normalised_laplacian
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.checks import check_targets, split_handles
-from jaxdeform.errors import ArrayLike, InputError
 
 
 class LaplacianEditor(eqx.Module):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxdeform.errors import InputError
+from jaxdeform._errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdeform._checks import as_array, check_positions, is_concrete, rows_of_three
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.rotations import (
     matrices_from_quaternions,
     quaternion_product,
     quaternions_from_matrices,
     rotation_matrices,
 )
-from jaxdeform.checks import as_array, check_positions, is_concrete, rows_of_three
-from jaxdeform.errors import ArrayLike, InputError
 
 
 def rigid_transforms(

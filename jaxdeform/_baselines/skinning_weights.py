@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.checks import (
+from jaxdeform._checks import (
     as_array,
     check_components,
     check_groups,
@@ -16,7 +15,8 @@ from jaxdeform.checks import (
     is_concrete,
     rows_of_three,
 )
-from jaxdeform.errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.mesh import Mesh
 
 
 def rigid_weights(

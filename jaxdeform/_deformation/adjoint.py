@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.descent import Descent, Solver
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform.checks import check_count, check_tolerance
-from jaxdeform.errors import InputError
+from jaxdeform._errors import InputError
 
 
 @dataclass(frozen=True)

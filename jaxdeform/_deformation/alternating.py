@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.adjoint import Unrolled
 from jaxdeform._deformation.descent import Descent
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._linalg.lbfgs import has_converged
-from jaxdeform.checks import check_count, check_tolerance
-from jaxdeform.result import Result
+from jaxdeform._result import Result
 
 
 @dataclass(frozen=True)

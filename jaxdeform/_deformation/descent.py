@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform.result import Result
+from jaxdeform._result import Result
 
 
 class Descent(NamedTuple):

@@ -14,7 +14,7 @@ from jaxdeform._deformation.local_step import (
     Newton,
     RotationFit,
 )
-from jaxdeform.errors import InputError
+from jaxdeform._errors import InputError
 
 _OURS = (Newton, LBFGS, GradientDescent, RotationFit, AffineFit)
 _METHODS = {

@@ -10,15 +10,15 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._checks import HandleSplit, check_rigidity, split_handles
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_map, stiffness
 from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.cells import Cells, principal_moments, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.checks import HandleSplit, check_rigidity, split_handles
-from jaxdeform.errors import ArrayLike, InputError
 
 
 class System(eqx.Module):

@@ -5,13 +5,13 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
+from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.adjoint import Implicit
 from jaxdeform._deformation.descent import Descent
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._linalg.lbfgs import Settings, minimize
-from jaxdeform.checks import check_count, check_tolerance
-from jaxdeform.result import Result
+from jaxdeform._result import Result
 
 
 @dataclass(frozen=True)

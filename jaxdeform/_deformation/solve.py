@@ -9,6 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._checks import (
+    as_array,
+    check_positions,
+    check_rigidity,
+    check_targets,
+    is_concrete,
+    read_positions,
+)
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.energy import local_energy
@@ -17,16 +25,8 @@ from jaxdeform._deformation.local_step_check import check_local_step
 from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform.checks import (
-    as_array,
-    check_positions,
-    check_rigidity,
-    check_targets,
-    is_concrete,
-    read_positions,
-)
-from jaxdeform.errors import ArrayLike, InputError
-from jaxdeform.result import Result
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._result import Result
 
 
 class Solution(eqx.Module):

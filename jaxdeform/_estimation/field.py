@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
 from jaxdeform._estimation.noise import NORMAL_95
 from jaxdeform._estimation.poses import (
@@ -33,7 +34,6 @@ from jaxdeform._estimation.poses import (
 from jaxdeform._estimation.search import Ending, Found, search
 from jaxdeform._linalg.cholesky import Factor, factorise
 from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian, lifted_weights
-from jaxdeform.errors import ArrayLike, InputError
 
 # Conjugate gradients of one Gauss-Newton step, which need not be exact.
 _CG_TOLERANCE, _CG_STEPS = 1e-2, 60

@@ -16,13 +16,13 @@ from jaxtyping import Float, Int
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.problem import Problem
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.bounded_gauss_newton import box_solver
 from jaxdeform._estimation.intervals import log_intervals, look_the_same, verdict
 from jaxdeform._estimation.noise import handle_modes
 from jaxdeform._estimation.part_model import Fit, PartModel
 from jaxdeform._estimation.poses import check_poses, diagonal
 from jaxdeform._estimation.search import Ending, search
-from jaxdeform.errors import ArrayLike, InputError
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxdeform._checks import as_array, check_positions, check_rigidity
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.solve import deform
-from jaxdeform.checks import as_array, check_positions, check_rigidity
-from jaxdeform.errors import InputError
+from jaxdeform._errors import InputError
 
 # Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.

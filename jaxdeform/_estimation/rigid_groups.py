@@ -6,8 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import ArrayLike, InputError
 
 # Rounds of growing and fitting again. Real meshes need 3 to 8.
 _GROWTHS = 50

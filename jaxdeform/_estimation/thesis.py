@@ -10,9 +10,9 @@ from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Solver
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.solve import deform
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.poses import check_poses, residual_of
 from jaxdeform._estimation.search import AT_LIMIT, CONVERGED_THESIS, NOT_FINITE, Ending
-from jaxdeform.errors import ArrayLike, InputError
 
 
 class ThesisEstimate(NamedTuple):

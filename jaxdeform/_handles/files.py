@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxdeform._checks import check_handles
+from jaxdeform._errors import InputError
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.checks import check_handles
-from jaxdeform.errors import InputError
 
 
 class HandleFile(NamedTuple):

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdeform._checks import as_array, check_groups, check_positions
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.rotations import rotation_matrices
-from jaxdeform.checks import as_array, check_groups, check_positions
-from jaxdeform.errors import ArrayLike, InputError
 
 
 def rigid_targets(

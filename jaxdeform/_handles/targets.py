@@ -15,8 +15,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.rotations import rotation_matrices
-from jaxdeform.errors import ArrayLike, InputError
 
 Points = Float[np.ndarray, "points 3"] | Float[Array, "points 3"]
 

@@ -7,9 +7,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh, content_digest
-from jaxdeform.errors import ArrayLike, InputError
 
 
 @dataclass(frozen=True, eq=False)

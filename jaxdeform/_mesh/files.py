@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.formats import FORMATS, ply_columns, to_ply
 from jaxdeform._mesh.mesh import Mesh, merge_equal_points
-from jaxdeform.errors import ArrayLike, InputError
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:

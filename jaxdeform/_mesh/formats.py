@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxdeform.errors import InputError
+from jaxdeform._errors import InputError
 
 
 def _broken(path: Path, what: str) -> InputError:

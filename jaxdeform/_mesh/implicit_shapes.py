@@ -17,8 +17,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._errors import InputError
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import InputError
 
 Points = Float[np.ndarray, "points 3"]
 Faces = Int[np.ndarray, "faces 3"]

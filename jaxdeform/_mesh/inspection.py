@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
     Mesh,
@@ -16,7 +17,6 @@ from jaxdeform._mesh.mesh import (
     merge_equal_points,
     unique_edges,
 )
-from jaxdeform.errors import ArrayLike, InputError
 
 # A broken mesh cannot become a Mesh, so the functions below take it in any of three forms.
 MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike

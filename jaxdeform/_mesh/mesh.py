@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from jaxdeform.errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError
 
 # A triangle has no area if its height is below this fraction of its longest edge: float64 cannot
 # tell such an area from rounding, and the cotangents would be noise. Thin but real triangles

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import ArrayLike, InputError
 
 
 @dataclass(frozen=True, eq=False)

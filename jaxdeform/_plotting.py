@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.files import check_place, write_atomically
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import ArrayLike, InputError
 
 
 def render(

@@ -7,8 +7,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform.errors import ArrayLike, InputError
 
 
 def is_concrete(x) -> bool:
