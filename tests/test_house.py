@@ -80,6 +80,21 @@ def test_every_public_name_is_explained(name):
                 assert inspect.getdoc(value), f"{name}.{member} has no docstring"
 
 
+def test_only_public_jax_is_used():
+    """jax.core keeps Tracer as a public name; jax.extend and jax.interpreters promise nothing."""
+    private = re.compile(r"jax\.(_src|extend|interpreters)\b|jax\.core\.(?!Tracer\b)")
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            else:
+                names = [ast.unparse(node)] if isinstance(node, ast.Attribute) else []
+            wrong = [name for name in names if private.match(name)]
+            assert not wrong, f"{path.name} uses {wrong}"
+
+
 def test_no_module_leaks_into_the_public_face():
     modules = {name for name, thing in vars(jd).items() if inspect.ismodule(thing)}
     assert {name for name in modules if not name.startswith("_")} == {"shapes"}

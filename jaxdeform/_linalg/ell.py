@@ -16,8 +16,11 @@ caller who has the transposed matrix gives it instead. ``y = K x`` is half of th
 
 and ``lax.custom_linear_solve`` takes a solver of this system and one of its transpose. It needs no
 private part of JAX, has forward and reverse mode of any order and vmap, and derives K too, from
-the residual of the system. The padding (x, 0) leaves no trace in the compiled program
-(tests/linalg/test_ell.py).
+the residual of the system. XLA removes the padding (x, 0): the compiled program has the gathers
+and the large copies of the bare products (tests/linalg/test_ell.py). Beside a pair of primitives
+of our own (private parts of JAX, and no derivatives to K) the values are bitwise equal and the
+processor time is the same: K 4.2 and 4.3 ms, K^T 4.4 and 4.5 ms, a Hessian product 12.6 and
+12.9 ms, four of them under vmap 34.8 and 33.8 ms (50,298 vertices, 2 cores, a loaded machine).
 """
 
 import equinox as eqx
@@ -52,8 +55,8 @@ class EllMatrix(eqx.Module):
         """Pack a grid of blocks (vertices, vertices); the width is the one that stores least."""
         pattern = sp.csr_matrix(sum(abs(block) for row in blocks for block in row))
         pattern.sort_indices()
-        n = pattern.shape[0]
         length = np.diff(pattern.indptr)
+        n = len(length)
         width = _best_width(length)
         row = np.repeat(np.arange(n), length)
         position = np.arange(pattern.nnz) - np.repeat(pattern.indptr[:-1], length)
