@@ -1,6 +1,10 @@
 """How a computation ended, as a sentence."""
 
+import operator
+from functools import reduce
+
 import equinox as eqx
+from jaxtyping import Array, Bool
 
 
 class Result(eqx.Enumeration):
@@ -24,3 +28,18 @@ class Result(eqx.Enumeration):
         "step, float64, or another scale of the targets and the rigidity (its unit is length "
         "squared)."
     )
+    fitted = "Converged: a further step would not lower the misfit visibly."
+    settled = "Stopped: rigidity changed by less than the threshold."
+    evaluation_limit = (
+        "Stopped at the limit of evaluations: allow more (max_evaluations), or start nearer."
+    )
+    fit_not_finite = (
+        "Not finite: a deformation overflowed. Check the scale of the mesh, the observed poses and "
+        "the start (rigidity is length squared), or use float64."
+    )
+
+
+def succeeded(result: Result) -> Bool[Array, "*batch"]:
+    """Return whether a computation ended as it should."""
+    good = Result.steps_done, Result.converged, Result.fitted, Result.settled
+    return reduce(operator.or_, (result == member for member in good))

@@ -249,7 +249,7 @@ def estimate(
     )
     console.print(_part_table(fit, label))
     console.print(f"misfit {fit.misfit:.4g} after {len(fit.history)} evaluations, {_since(began)}")
-    console.print(str(fit.result))
+    console.print(jd.Result[fit.result])
     jd.save_mesh(out, shape, rigidity=fit.field)
     text = json.dumps(_as_json(fit, index), indent=1, allow_nan=False)
     write_atomically(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
@@ -312,7 +312,7 @@ def _as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
         ],
         "misfit": finite(fit.misfit),
         "history": list(map(finite, fit.history)),
-        "result": {"ok": fit.result.ok, "sentence": str(fit.result)},
+        "result": {"ok": fit.ok, "sentence": jd.Result[fit.result]},
         "handles": handles.tolist(),
     }
 

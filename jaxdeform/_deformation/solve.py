@@ -26,7 +26,7 @@ from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._result import Result
+from jaxdeform._result import Result, succeeded
 
 
 class Solution(eqx.Module):
@@ -46,7 +46,7 @@ class Solution(eqx.Module):
     @property
     def ok(self) -> Bool[Array, "*batch"]:
         """True if it converged, or ran the number of steps that was asked for."""
-        return (self.result == Result.converged) | (self.result == Result.steps_done)
+        return succeeded(self.result)
 
     def explain(self) -> str:
         """Return what happened in words, with the first cells that have no finite transformation.

@@ -124,11 +124,12 @@ def box_least_squares(
     that the equations do not determine stay where they are (the pseudoinverse).
     """
     pseudoinverse = lx.SVD(rcond=_RANK_TOLERANCE)
+    # A slope below this is rounding.
     rounding = 10.0 * jnp.finfo(jacobian.dtype).eps
     rounding *= jnp.linalg.norm(jacobian, axis=0) * jnp.linalg.norm(residual)
 
     def on_free(free, step):
-        """Return the minimum over the free unknowns, the others held."""
+        """Return the minimum over the free unknowns, with the others as they are."""
         rest = residual + jacobian @ jnp.where(free, 0.0, step)
         operator = lx.MatrixLinearOperator(jnp.where(free[None, :], jacobian, 0.0))
         solution = lx.linear_solve(operator, -rest, pseudoinverse, throw=False).value
@@ -145,7 +146,7 @@ def box_least_squares(
         fraction = jnp.where(outside.any(), way[first], 1.0)
         step = jnp.where(hit, bound, state.step + fraction * (goal - state.step))
         step = jnp.clip(step, low, high)
-        # At the minimum over the free ones: let go one whose bound the slope leads away from.
+        # At the minimum over the free ones, release one that the slope drives off its bound.
         slope = jacobian.T @ (residual + jacobian @ step)
         inwards = jnp.where(step <= low, -slope, 0.0) + jnp.where(step >= high, slope, 0.0)
         inwards = jnp.where(state.free | (low == high), 0.0, inwards)
@@ -165,7 +166,7 @@ def box_least_squares(
 class RayDescent(optx.AbstractDescent):
     """Go along the Gauss-Newton step, at most step_size in any unknown, clipped to the bounds.
 
-    Many unknowns: ``solve`` takes the Jacobian (matrix-free) and the negative gradient.
+    Many unknowns: ``solve`` finds the step from the Jacobian, matrix-free, and the residual.
     """
 
     lower: Float[Array, "unknowns"]
@@ -197,16 +198,14 @@ class _TrustRegion(NamedTuple):
 
 
 class CappedTrustRegion(optx.AbstractSearch):
-    """optimistix's classical trust region with a largest size, measured in the largest norm.
+    """optimistix's classical trust region with a largest size, in the maximum norm.
 
-    After a rejection it shrinks from the length that was tried: bounds may have cut the step below
+    After a rejection it shrinks from the length that was tried. Bounds may have cut that step below
     the size allowed, and the same step again would be a wasted evaluation.
     """
 
     largest: Float[Array, ""]
-    rule: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
-        high_cutoff=0.0, low_cutoff=0.0, high_constant=2.0, low_constant=0.25
-    )
+    rule: optx.ClassicalTrustRegion
 
     def init(self, y, f_info_struct):
         """Allow the largest step at first."""
@@ -216,7 +215,7 @@ class CappedTrustRegion(optx.AbstractSearch):
         """Return the size of the next step and whether the last one is taken."""
 
         def judge():
-            # The rule multiplies the size; with a size of 1 it tells the factor.
+            # The rule multiplies its size, which is 1 here: so it returns the factor.
             unit = self.rule.init(y, f_info)
             factor, accept, _, _ = self.rule.step(first_step, y, y_eval, f_info, f_eval_info, unit)
             tried = jnp.abs(y_eval - y).max()
@@ -279,7 +278,7 @@ def _solver(descent: BoxDescent | RayDescent, gain: float) -> BoundedGaussNewton
         rtol=number(gain),
         atol=number(_SHORTEST_STEP),
         descent=descent,
-        search=CappedTrustRegion(number(_LARGEST_STEP)),
+        search=CappedTrustRegion(number(_LARGEST_STEP), optx.ClassicalTrustRegion()),
     )
 
 

@@ -30,17 +30,18 @@ class Curvature(NamedTuple):
 def curvature(model: PartModel, best: Fit, modes: np.ndarray | None) -> Curvature:
     """Return the intervals of the linear model."""
     count = len(best.theta)
+    floor = same_length(model.problem) ** 2
+    # A part without influence gets a wide interval, not a singular matrix.
+    ridge = np.finfo(float).eps * (np.trace(best.normal) + floor) * np.eye(count)
+    inverse = np.linalg.inv(best.normal + ridge)
     freedom, meat = model.poses.count - count, best.normal
     if modes is not None:
         field = model.field(best.theta)
         freedom, meat = sandwich(
             model.problem, model.poses, field, best.jacobian, modes, model.solver, model.adjoint
         )
-    floor = same_length(model.problem) ** 2
     variance = max(best.cost / max(freedom, 1), floor)
-    ridge = np.finfo(float).eps * (np.trace(best.normal) + floor)
-    inverse = np.linalg.inv(best.normal + ridge * np.eye(count))
-    spread = np.diag(inverse @ meat @ inverse)
+    spread = np.diag(inverse @ (meat + ridge) @ inverse)
     return Curvature(NORMAL_95 * np.sqrt(np.maximum(variance * spread, 0.0)), np.diag(inverse))
 
 

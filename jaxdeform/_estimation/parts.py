@@ -22,7 +22,8 @@ from jaxdeform._estimation.intervals import log_intervals, look_the_same, verdic
 from jaxdeform._estimation.noise import handle_modes
 from jaxdeform._estimation.part_model import Fit, PartModel
 from jaxdeform._estimation.poses import check_poses, diagonal
-from jaxdeform._estimation.search import Ending, search
+from jaxdeform._estimation.search import search
+from jaxdeform._result import Result, succeeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +46,13 @@ class Estimate:
     """Root mean square of the differences between fitted and observed coordinates (a length)."""
     history: Float[np.ndarray, "evaluations"]
     """Misfit of each evaluation, accepted or not."""
-    result: Ending
-    """How the search ended, as a sentence."""
+    result: Result
+    """How the search ended: a member of :class:`Result`."""
+
+    @property
+    def ok(self) -> bool:
+        """True if the search converged."""
+        return bool(succeeded(self.result))
 
 
 def estimate_rigidity(
@@ -130,7 +136,7 @@ def estimate_rigidity(
         vertices=best.vertices,
         misfit=poses.root_mean_square(best.residual),
         history=np.array(found.history),
-        result=found.ending,
+        result=found.result,
     )
 
 
@@ -138,7 +144,7 @@ class _FoundParts(NamedTuple):
     best: Fit
     modes: np.ndarray | None
     """Modes of the handles' noise that weight the residual."""
-    ending: Ending
+    result: Result
     history: list[float]
 
 
@@ -155,15 +161,15 @@ def _search_parts(model: PartModel, theta, noisy_handles: bool, limit: int, prog
 
     solver, modes = box_solver(*model.bounds), None
     first = counted(theta, modes)
-    best, ending = search(partial(counted, modes=modes), first, solver, limit - len(history))
-    if noisy_handles and ending.ok:
+    best, result = search(partial(counted, modes=modes), first, solver, limit - len(history))
+    if noisy_handles and succeeded(result):
         field = model.field(best.theta)
         modes = np.asarray(
             handle_modes(model.problem, model.poses, field, model.solver, model.adjoint)
         )
         first = model.weighted(best.theta, best, modes)
-        best, ending = search(partial(counted, modes=modes), first, solver, limit - len(history))
-    return _FoundParts(best, modes, ending, history)
+        best, result = search(partial(counted, modes=modes), first, solver, limit - len(history))
+    return _FoundParts(best, modes, result, history)
 
 
 def check_parts(parts: ArrayLike, n: int) -> Int[np.ndarray, "vertices"]:

@@ -15,33 +15,10 @@ import optimistix as optx
 from scipy import optimize
 
 from jaxdeform._estimation.bounded_gauss_newton import BoundedGaussNewton, Evaluation, recorded
+from jaxdeform._result import Result
 
 # Bounds of intervals are good to this much of log rigidity.
 _BOUND_WIDTH = 0.05
-
-
-class Ending(NamedTuple):
-    """How a search ended; ``str(ending)`` is a sentence."""
-
-    ok: bool
-    sentence: str
-
-    def __str__(self) -> str:
-        """Return the sentence."""
-        return self.sentence
-
-
-CONVERGED = Ending(True, "Converged: a further step would not lower the misfit visibly.")
-CONVERGED_THESIS = Ending(True, "Stopped: rigidity changed by less than the threshold.")
-AT_LIMIT = Ending(
-    False,
-    "Stopped at the limit of evaluations: allow more (max_evaluations), or start nearer.",
-)
-NOT_FINITE = Ending(
-    False,
-    "Not finite: a deformation overflowed. Check the scale of the mesh, the observed poses and "
-    "the start (rigidity is length squared), or use float64.",
-)
 
 
 @eqx.filter_jit
@@ -73,7 +50,7 @@ class Found(NamedTuple):
     """What a search returns."""
 
     best: Any
-    ending: Ending
+    result: Result
 
 
 def search(
@@ -91,16 +68,16 @@ def search(
     point = first.evaluation.point
     state = _begin(solver, first.evaluation)
     for more in range(max_evaluations, -1, -1):
-        point, state, done, result = _advance(solver, point, tried.evaluation, state)
+        point, state, done, why = _advance(solver, point, tried.evaluation, state)
         if state.num_steps_since_acceptance == 0:
             best = tried
-        if result == optx.RESULTS.nonfinite:
-            return Found(best, NOT_FINITE)
+        if why == optx.RESULTS.nonfinite:
+            return Found(best, Result.fit_not_finite)
         if done:
-            return Found(best, CONVERGED)
+            return Found(best, Result.fitted)
         if more:
             tried = evaluate(np.asarray(state.y_eval))
-    return Found(best, AT_LIMIT)
+    return Found(best, Result.evaluation_limit)
 
 
 # ---------------------------------------------------------------- bounds of intervals
@@ -117,8 +94,8 @@ def profile_bound(
     """Return where the cost exceeds what noise allows, on the way from the best value to an end.
 
     ``beyond`` if it is allowed up to the end. Brent's method on the square root of the excess over
-    the least cost: near a minimum that is a straight line (2 to 8 evaluations on average, where bisection
-    took 9 or 10). It is cut off where it is far too large, or not a number.
+    the least cost: near a minimum that is a straight line (on average 2 to 8 evaluations, where
+    bisection took 9 or 10). It is cut off where it is far too large, or not a number.
     """
     known = {best: -1.0}
 

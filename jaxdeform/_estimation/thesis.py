@@ -12,7 +12,7 @@ from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.poses import check_poses, residual_of
-from jaxdeform._estimation.search import AT_LIMIT, CONVERGED_THESIS, NOT_FINITE, Ending
+from jaxdeform._result import Result
 
 
 class ThesisEstimate(NamedTuple):
@@ -23,7 +23,7 @@ class ThesisEstimate(NamedTuple):
     """Rigidity at each evaluation."""
     history: Float[np.ndarray, "evaluations"]
     """Frobenius norm of the difference at each."""
-    result: Ending
+    result: Result
 
 
 def estimate_rigidity_thesis(
@@ -65,9 +65,11 @@ def estimate_rigidity_thesis(
         path.append(rigidity)
         history.append(float(jnp.linalg.norm(residual_of(poses, vertices[None]))))
         if not np.isfinite(history[-1]):
-            return ThesisEstimate(rigidity, np.array(path), np.array(history), NOT_FINITE)
+            return ThesisEstimate(
+                rigidity, np.array(path), np.array(history), Result.fit_not_finite
+            )
         step = step_size * history[-1]
         rigidity += step
         if step / rigidity < threshold:
-            return ThesisEstimate(rigidity, np.array(path), np.array(history), CONVERGED_THESIS)
-    return ThesisEstimate(rigidity, np.array(path), np.array(history), AT_LIMIT)
+            return ThesisEstimate(rigidity, np.array(path), np.array(history), Result.settled)
+    return ThesisEstimate(rigidity, np.array(path), np.array(history), Result.evaluation_limit)

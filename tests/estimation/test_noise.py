@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FD, THESIS
+from helpers import EXACT, FD, THESIS
 
 import jaxdeform as jd
-from jaxdeform._estimation.noise import handle_modes, sandwich, weigh
+from jaxdeform._estimation.noise import handle_modes, sandwich, whiten
 from jaxdeform._estimation.poses import Poses, deform_all
 
 
@@ -32,6 +32,21 @@ def test_derivatives_agree_three_ways(bar_problem, bar_targets, halves):
             assert error < FD
 
 
+@pytest.mark.parametrize("size", [0.1, 1.0, 100.0])
+def test_whitening_twice_is_the_inverse_covariance(size):
+    draw = np.random.default_rng(0)
+    modes = size * draw.standard_normal((2, 30, 4))
+    columns = draw.standard_normal((2, 30, 3))
+    covariance = np.eye(30) + modes @ np.swapaxes(modes, 1, 2)
+    once = whiten(columns, modes)
+    np.testing.assert_allclose(
+        whiten(once, modes), np.linalg.solve(covariance, columns), atol=EXACT
+    )
+    products = np.swapaxes(columns, 1, 2) @ np.linalg.solve(covariance, columns)
+    np.testing.assert_allclose(np.swapaxes(once, 1, 2) @ once, products, atol=EXACT)
+    assert whiten(columns, None) is columns
+
+
 @pytest.mark.slow
 def test_handle_noise_against_the_dense_covariance():
     """W = (I + U U^T)^-1 is exact where the modes are all; then the sandwich is J^T W J."""
@@ -52,7 +67,8 @@ def test_handle_noise_against_the_dense_covariance():
     columns = np.random.default_rng(0).standard_normal((1, 9, 3, 2)) * free[..., None, None]
     flat = columns.reshape(1, 27, 2)
     expected = np.linalg.solve(covariance, flat[0])
-    np.testing.assert_allclose(weigh(flat, modes)[0], expected, atol=1e-4)
+    weighted = whiten(whiten(flat, modes), modes)
+    np.testing.assert_allclose(weighted[0], expected, atol=1e-4)
     freedom, meat = sandwich(problem, poses, field, columns, modes, solver, jd.Implicit())
     np.testing.assert_allclose(meat, flat[0].T @ expected, rtol=1e-3)
     # tr(W S) is the number of coordinates; Hutchinson's eight probes leave little here.

@@ -18,7 +18,7 @@ def test_one_rigidity_is_recovered_from_a_soft_start(bar_problem, pose_of, true)
     fit = jd.estimate_rigidity(bar_problem, pose_of(true), start=0.01)
     assert abs(fit.rigidity[0] / true - 1) < 1e-6
     assert len(fit.history) <= 15
-    assert fit.result.ok
+    assert fit.ok
     assert fit.interval[0, 0] <= true <= fit.interval[0, 1]
     np.testing.assert_allclose(fit.vertices[0], pose_of(true), atol=1e-6)
 
@@ -34,7 +34,7 @@ def test_two_materials_are_recovered_though_some_vertices_are_hidden(bar_problem
     fit = jd.estimate_rigidity(bar_problem, pose, parts=halves, mask=seen)
     np.testing.assert_allclose(fit.rigidity, true, rtol=1e-6)  # asked for: 1 %
     np.testing.assert_array_equal(fit.field, fit.rigidity[halves])
-    assert fit.result.ok
+    assert fit.ok
 
 
 def test_the_rest_shape_tells_nothing(bar, bar_problem):

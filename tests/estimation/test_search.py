@@ -14,6 +14,7 @@ from scipy.optimize import least_squares, lsq_linear
 import jaxdeform as jd
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, box_least_squares, box_solver
 from jaxdeform._estimation.search import profile_bound, search
+from jaxdeform._result import succeeded
 
 
 class Tried(NamedTuple):
@@ -23,7 +24,7 @@ class Tried(NamedTuple):
 class Run(NamedTuple):
     point: np.ndarray
     tried: np.ndarray
-    ending: object
+    result: jd.Result
 
 
 def minimise(residual, start, bounds, limit=100) -> Run:
@@ -37,8 +38,8 @@ def minimise(residual, start, bounds, limit=100) -> Run:
         return Tried(Evaluation(point, residual(point), jacobian))
 
     first = evaluate(np.asarray(start, float))
-    best, ending = search(evaluate, first, box_solver(*np.asarray(bounds, float)), limit)
-    return Run(np.asarray(best.evaluation.point), np.array(tried), ending)
+    best, result = search(evaluate, first, box_solver(*np.asarray(bounds, float)), limit)
+    return Run(np.asarray(best.evaluation.point), np.array(tried), result)
 
 
 def rosenbrock(x):
@@ -86,7 +87,7 @@ def test_it_ends_where_scipy_ends(residual, start, bounds):
         ftol=1e-14,
         gtol=1e-14,
     )
-    assert found.ending.ok
+    assert succeeded(found.result)
     np.testing.assert_allclose(found.point, peer.x, atol=1e-5)  # TRF stays inside the bounds
     cost = float(jnp.sum(residual(jnp.asarray(found.point)) ** 2))
     assert cost <= 2.0 * peer.cost * (1 + PEER) + EXACT
@@ -94,10 +95,11 @@ def test_it_ends_where_scipy_ends(residual, start, bounds):
 
 @pytest.mark.parametrize("start", [[0.1, 0.1, 0.1], [5.0, 2.0, -3.0]])
 def test_it_ends_where_optimistix_ends_without_bounds(start):
+    """To 1e-4: the search leaves the last 1e-10 of the cost, which is 1e-5 of a misfit."""
     found = minimise(decay, start, [[-50] * 3, [50] * 3])
     peer = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
     expected = optx.least_squares(lambda x, _: decay(x), peer, jnp.asarray(start))
-    np.testing.assert_allclose(found.point, expected.value, rtol=PEER)
+    np.testing.assert_allclose(found.point, expected.value, rtol=1e-4)
     assert len(found.tried) <= int(expected.stats["num_steps"])
 
 
@@ -118,13 +120,13 @@ def test_what_is_not_determined_stays_where_it_was():
         return jnp.stack([x[0] + x[1] - 3.0, 2.0 * (x[0] + x[1]) - 7.0])
 
     found = minimise(residual, [0.5, -0.5, 4.0], [[-9] * 3, [9] * 3])
-    assert found.ending.ok
+    assert succeeded(found.result)
     np.testing.assert_allclose(found.point, [2.2, 1.2, 4.0], rtol=PEER)
 
 
 def test_an_exact_start_is_one_evaluation():
     found = minimise(rosenbrock, [1.0, 1.0], [[-9, -9], [9, 9]])
-    assert found.ending.ok
+    assert succeeded(found.result)
     assert len(found.tried) == 1
 
 
@@ -134,7 +136,7 @@ def test_an_exact_start_is_one_evaluation():
 def test_a_step_into_nan_is_taken_back():
     """From 1 the first step leads to -0.8, whose root is not a number."""
     found = minimise(lambda x: jnp.sqrt(x) - 0.1, [1.0], [[-9], [9]])
-    assert found.ending.ok
+    assert succeeded(found.result)
     np.testing.assert_allclose(found.point, 0.01, rtol=PEER)
 
 
@@ -142,8 +144,8 @@ def test_it_says_when_nothing_is_finite():
     everywhere = minimise(lambda x: x * jnp.nan, [1.0], [[-9], [9]])
     around = minimise(lambda x: jnp.where(x == 1.0, x, jnp.nan), [1.0], [[-9], [9]])
     for found in (everywhere, around):
-        assert not found.ending.ok
-        assert "Not finite" in str(found.ending)
+        assert not succeeded(found.result)
+        assert "Not finite" in str(found.result)
         np.testing.assert_array_equal(found.point, [1.0])
     assert len(everywhere.tried) == 1
 
@@ -151,7 +153,7 @@ def test_it_says_when_nothing_is_finite():
 @pytest.mark.parametrize("limit", [0, 1, 4])
 def test_it_keeps_to_the_limit(limit):
     found = minimise(rosenbrock, [-1.2, 1.6], [[-9, -9], [9, 9]], limit)
-    assert not found.ending.ok
+    assert not succeeded(found.result)
     assert len(found.tried) == 1 + limit
     costs = [float(jnp.sum(rosenbrock(x) ** 2)) for x in found.tried]
     np.testing.assert_array_equal(found.point, found.tried[np.argmin(costs)])
@@ -205,12 +207,12 @@ def bound(cost, end, beyond=np.inf):
 @pytest.mark.parametrize(
     ("cost", "end", "expected", "evaluations"),
     [
-        (lambda x: 1.0 + (x / 3.0) ** 2, 20.0, 3.0, 3),
-        (lambda x: 1.0 + (x / 3.0) ** 2, -20.0, -3.0, 3),
-        (lambda x: 1.0 + 1.2 * (1.0 - np.exp(-((x / 2.0) ** 2))), -25.0, -2.677, 7),
+        (lambda x: 1.0 + (x / 3.0) ** 2, 20.0, 3.0, 4),
+        (lambda x: 1.0 + (x / 3.0) ** 2, -20.0, -3.0, 4),
+        (lambda x: 1.0 + 1.2 * (1.0 - np.exp(-((x / 2.0) ** 2))), -25.0, -2.677, 9),
         (lambda x: 1.0 + 2.0 * (x > 4.7), 20.0, 4.7, 13),
         (lambda x: 1.0 + (x / 3.0) ** 2 if x < 4.0 else np.nan, 20.0, 3.0, 10),
-        (lambda x: np.nan if x > 2.0 else 0.9, 20.0, 2.0, 10),
+        (lambda x: np.nan if x > 2.0 else 0.9, 20.0, 2.0, 13),
     ],
 )
 def test_bounds_are_found(cost, end, expected, evaluations):
@@ -231,7 +233,7 @@ def test_the_search_says_when_it_was_cut_short(bar_problem, bar_targets, pose_of
     fit = jd.estimate_rigidity(
         bar_problem, pose_of(30.0), targets=bar_targets, start=0.01, max_evaluations=2
     )
-    assert not fit.result.ok
+    assert not fit.ok
     assert len(fit.history) == 2
     assert "max_evaluations" in str(fit.result)
 
