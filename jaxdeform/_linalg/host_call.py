@@ -13,6 +13,7 @@ import atexit
 import contextlib
 import ctypes
 import threading
+import time
 from collections.abc import Callable
 
 import jax
@@ -22,6 +23,7 @@ from jaxtyping import Array
 from jaxdeform._linalg.ffi import C_FUNCTION, Interface
 
 _used, _exiting = threading.Event(), threading.Event()
+_running: list[str] = []
 
 
 class HostFunction:
@@ -40,7 +42,11 @@ class HostFunction:
         def unless_exiting(*arrays: np.ndarray) -> None:
             if _exiting.is_set():
                 raise RuntimeError("Python is about to exit")
-            function(*arrays)
+            _running.append(name)
+            try:
+                function(*arrays)
+            finally:
+                _running.pop()
 
         if interface is not None:
             pointer = C_FUNCTION(interface.handler(unless_exiting))
@@ -80,5 +86,7 @@ def _leave() -> None:
                 array.block_until_ready()
         # What runs now has results that nobody kept. It may fail, and the client is not freed.
         _exiting.set()
+        while _running:
+            time.sleep(1e-3)
         client = jax.devices("cpu")[0].client
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
