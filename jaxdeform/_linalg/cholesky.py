@@ -19,11 +19,12 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int32, UInt32
 
 from jaxdeform._linalg.factor_cache import SHIFTS, Matrix, NotPositiveDefinite, cholesky, factors
-from jaxdeform._linalg.host_call import HostFunction, installed_interface
+from jaxdeform._linalg.ffi import installed_interface
+from jaxdeform._linalg.host_call import HostFunction
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
 
 # Up to this many vertices the inverse is kept as a dense matrix where a call to the host is dear:
-# where there is an accelerator, or no FFI (host_call.py).
+# where there is an accelerator, or no FFI (ffi.py).
 DENSE_BELOW = 1000
 
 

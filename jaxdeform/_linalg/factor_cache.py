@@ -1,4 +1,8 @@
-"""Cholesky factors of this process, found by the content of their matrix."""
+"""Cholesky factors of this process, found by the content of their matrix.
+
+Together they take at most 2 GiB, or the number of bytes in the environment variable
+JAXDEFORM_FACTOR_BYTES. A factor that had to go is made again when it is needed.
+"""
 
 import atexit
 import hashlib
@@ -234,4 +238,6 @@ def _mixed_up() -> ValueError:
 
 
 factors = FactorCache(CAPACITY)
+# nanobind would call them leaked. Programs have ended then: host_call.py, imported later, is asked
+# earlier.
 atexit.register(factors.clear)

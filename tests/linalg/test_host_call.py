@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdeform._linalg import host_call
-from jaxdeform._linalg.host_call import HostFunction, Interface, installed_interface
+from jaxdeform._linalg.ffi import Interface, installed_interface
+from jaxdeform._linalg.host_call import HostFunction
 
 HEADER = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h").read_text()
 
@@ -138,4 +138,4 @@ def test_an_unknown_header_means_callbacks(pattern, replacement, tmp_path, monke
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
     assert installed_interface() is None
     file.unlink()
-    assert host_call.installed_interface() is None
+    assert installed_interface() is None

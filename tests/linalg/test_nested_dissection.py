@@ -186,7 +186,7 @@ def test_deform_on_an_accelerator(bar, bar_problem, bar_targets, accelerator):
     problem = jd.precompute(bar, bar_problem.handles)
     assert isinstance(problem.system.factor, DissectedFactor)
     out, peer = jd.deform(problem, bar_targets, 0.1), jd.deform(bar_problem, bar_targets, 0.1)
-    assert bool(out.result.ok)
+    assert bool(out.ok)
     # Both stop within 1e-8 of the energy's minimum, which leaves the vertices this far apart.
     np.testing.assert_allclose(out.vertices, peer.vertices, atol=1e-3)
     np.testing.assert_allclose(out.energy[-1], peer.energy[-1], rtol=1e-7)
