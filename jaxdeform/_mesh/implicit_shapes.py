@@ -166,7 +166,9 @@ def _field(points: Points, cones: list[Cone], width: float) -> Float[np.ndarray,
     return -0.5 * width * np.log(total)
 
 
-def _collapse_short_edges(points: Points, faces: Faces, shortest: float) -> tuple[Points, Faces]:
+def _collapse_short_edges(
+    points: Points, faces: Faces, shortest: float
+) -> tuple[Float[np.ndarray, "kept_points 3"], Int[np.ndarray, "kept_faces 3"]]:
     """Merge vertices closer than ``shortest``: marching cubes leaves slivers at clipped corners.
 
     Each vertex takes part in one merge at most, and only where the two share exactly two
