@@ -130,11 +130,11 @@ def precompute(
     rest = mesh.vertices - center
     used, matrix, factor = _factorise(cells, rest, split, dtype)
     moments, axes = principal_moments(used)
-    put = lambda x, kind=dtype: jax.device_put(np.asarray(x, kind))  # noqa: E731 (compiles nothing)
+    put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
     system = System(
         rest=put(rest.T),
         center=put(center),
-        free=put(split.free, bool),
+        free=jax.device_put(split.free),
         soft=put(split.soft),
         principal_moments=put(moments.T),
         principal_axes=put(axes.transpose(1, 2, 0)),
@@ -142,7 +142,7 @@ def precompute(
         stiffness=EllMatrix.build([[sp.csr_matrix(matrix)]], dtype),
         factor=factor,
         initial_guess=laplacian_guess(used, split.free & (split.soft == 0), dtype),
-        faces=put(mesh.faces, np.int32),
+        faces=jax.device_put(mesh.faces.astype(np.int32)),
     )
     return Problem(system, split.index, cells)
 

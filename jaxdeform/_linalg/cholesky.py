@@ -1,9 +1,8 @@
 """The global step: a sparse system factored once, solved in every iteration (Eq. 4.5).
 
-The free unknowns are eliminated from the fixed ones beforehand: a factor holds the matrix of the
-free vertices only, takes (..., 3, n) right-hand sides, ignores their fixed entries and returns
-zeros there. All its shapes depend on the mesh alone, so another handle set runs the code that is
-compiled already.
+Fixed vertices are eliminated first: a factor holds only the free-free block A_ff. It takes
+right-hand sides (..., 3, vertices), ignores their fixed entries and returns zeros there. All its
+shapes depend on the mesh alone, so another handle set runs the code that is compiled already.
 
 On a CPU it is CHOLMOD's factor on the host (factor_cache.py). On a GPU or TPU it is one made of
 products (nested_dissection.py) or, for small meshes, the inverse.
@@ -29,11 +28,11 @@ DENSE_BELOW = 1000
 
 
 class DenseInverse(eqx.Module):
-    """The inverse as a dense (n, n) matrix with zero rows and columns at the fixed vertices."""
+    """The inverse as a dense matrix, with zero rows and columns at the fixed vertices."""
 
-    inverse: Float[Array, "n n"]
+    inverse: Float[Array, "vertices vertices"]
 
-    def solve(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def solve(self, right: Float[Array, "... vertices"]) -> Float[Array, "... vertices"]:
         """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed vertices."""
         # A GPU would by default round float32 to TF32, three digits, before it multiplies. So all
         # products of this package name their precision.
@@ -52,9 +51,9 @@ class HostCholesky(eqx.Module):
     starts: Int32[Array, "columns"]
     rows: Int32[Array, "entries"]
     values: UInt32[Array, "entries 2"]
-    free: Bool[Array, "n"]
+    free: Bool[Array, "vertices"]
 
-    def solve(self, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def solve(self, right: Float[Array, "... vertices"]) -> Float[Array, "... vertices"]:
         """Return x with ``A_ff x_f = right_f`` and ``x = 0`` at fixed vertices."""
         # custom_linear_solve gives the derivatives: a symmetric solve is its own adjoint. The
         # operator itself is never applied, because the matrix has no tangent.
@@ -63,7 +62,9 @@ class HostCholesky(eqx.Module):
 
 
 @jax.jit
-def _call_host(factor: HostCholesky, right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+def _call_host(
+    factor: HostCholesky, right: Float[Array, "... vertices"]
+) -> Float[Array, "... vertices"]:
     """Call the host with columns (n, k), as CHOLMOD wants them, and zeros at fixed unknowns."""
     columns = right.reshape(math.prod(right.shape[:-1]), right.shape[-1]).T
     columns = jnp.where(factor.free[:, None], columns, jnp.zeros((), right.dtype))
@@ -77,12 +78,12 @@ Factor = DenseInverse | DissectedFactor | HostCholesky
 
 def factorise(
     matrix: sp.spmatrix,
-    free: Bool[np.ndarray, "n"],
+    free: Bool[np.ndarray, "vertices"],
     dtype: np.dtype,
     *,
-    positions: Float[np.ndarray, "n 3"] | None = None,
+    positions: Float[np.ndarray, "vertices 3"] | None = None,
 ) -> Factor:
-    """Return a factor of the free part of a symmetric positive definite matrix (n, n).
+    """Return a factor of the free part of a symmetric positive definite matrix.
 
     Without positions, where the unknowns lie, it is for a first guess, solved once a deformation:
     a factor on the host is made at the first solve, and a matrix that rounding has made indefinite
@@ -111,7 +112,7 @@ def factorise(
 
 def dense_inverse(
     matrix: sp.spmatrix,
-    free: Bool[np.ndarray, "n"],
+    free: Bool[np.ndarray, "vertices"],
     dtype: np.dtype,
     shifts: tuple[float, ...] = SHIFTS[:1],
 ) -> DenseInverse:
@@ -143,9 +144,11 @@ def _solve_on_host(out: np.ndarray, *operands: np.ndarray) -> None:
         _solve_columns(out, matrix, columns)
         return
     batch = np.broadcast_shapes(*(x.shape[:lead] for x in matrix))
-    for lane in np.ndindex(batch):
-        one = [x[tuple(i % size for i, size in zip(lane, x.shape, strict=False))] for x in matrix]
-        shared = tuple(slice(None) if size == 1 else i for i, size in zip(lane, batch, strict=True))
+    for member in np.ndindex(batch):
+        one = [x[tuple(i % size for i, size in zip(member, x.shape, strict=False))] for x in matrix]
+        shared = tuple(
+            slice(None) if size == 1 else i for i, size in zip(member, batch, strict=True)
+        )
         right = np.broadcast_to(columns, out.shape)[shared]
         packed = np.moveaxis(right, -2, 0)
         solution = np.empty(packed.shape, out.dtype)
@@ -158,7 +161,7 @@ def _solve_columns(out: np.ndarray, matrix: list[np.ndarray], columns: np.ndarra
     key, *content = matrix
     factor = factors.get(key, Matrix(*content), columns.dtype)
     if columns.size:
-        factor.solve(np.require(columns, requirements="CW"), out)
+        factor.solve(np.require(columns, requirements=["C", "W"]), out)
 
 
 _host_solve = HostFunction("jaxdeform_cholesky_solve", _solve_on_host, installed_interface())

@@ -37,7 +37,7 @@ class NotPositiveDefinite(ValueError):
 
 
 class Matrix(NamedTuple):
-    """A symmetric matrix (n, n) and which of its unknowns are free, as exact arrays.
+    """A symmetric matrix (vertices, vertices) and which of its unknowns are free, as exact arrays.
 
     Of the lower triangle, column by column, the whole diagonal and what is not zero below it.
     """
@@ -48,14 +48,14 @@ class Matrix(NamedTuple):
     values: UInt32[np.ndarray, "entries 2"]
     """The bits of the float64 values. As numbers JAX would round them to float32 where it is not
     set to float64; and L^T L in float32 is often not positive definite."""
-    free: Bool[np.ndarray, "n"]
+    free: Bool[np.ndarray, "vertices"]
 
     @staticmethod
-    def of(matrix: sp.spmatrix, free: Bool[np.ndarray, "n"]) -> "Matrix":
+    def of(matrix: sp.spmatrix, free: Bool[np.ndarray, "vertices"]) -> "Matrix":
         """Take the lower triangle of a sparse matrix."""
         n = matrix.shape[0]
         below, diagonal = sp.coo_matrix(sp.tril(matrix, -1)), np.arange(n)
-        entries = np.concatenate([matrix.diagonal(), below.data]).astype(np.float64)
+        entries = np.concatenate([sp.csr_matrix(matrix).diagonal(), below.data]).astype(np.float64)
         i, j = np.concatenate([diagonal, below.row]), np.concatenate([diagonal, below.col])
         lower = sp.csc_matrix((entries, (i, j)), shape=(n, n))
         lower.sort_indices()
@@ -65,9 +65,9 @@ class Matrix(NamedTuple):
     def key(self) -> UInt32[np.ndarray, "4"]:
         """Return a hash of the content."""
         digest = hashlib.blake2b(digest_size=16)
-        digest.update(np.array([len(self.free), len(self.rows)], np.int64))
+        digest.update(np.array([len(self.free), len(self.rows)], np.int64).data)
         for part in self:
-            digest.update(np.ascontiguousarray(part))
+            digest.update(np.ascontiguousarray(part).data)
         return np.frombuffer(digest.digest(), np.uint32)
 
     def equals(self, other: "Matrix") -> bool:
@@ -100,7 +100,7 @@ def cholesky(lower: sp.csc_matrix, dtype: np.dtype, shifts: tuple[float, ...]) -
         values = lower.data.copy()
         values[starts[:-1]] *= 1.0 + shift
         try:
-            return kind(lower.shape[0], starts, rows, values, MatrixType.CSC)
+            return kind(len(starts) - 1, starts, rows, values, MatrixType.CSC)
         except ValueError:
             continue
     raise NotPositiveDefinite(

@@ -101,7 +101,7 @@ class Interface:
             shape = (ctypes.c_int64 * rank).from_address(buffer.dims)[:] if rank else ()
             size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
             memory = (ctypes.c_char * size).from_address(buffer.data) if size else b""
-            return np.ndarray(shape, dtype, memory)
+            return np.ndarray(shape, dtype, memoryview(memory))
 
         def views(count: int, addresses: int) -> list[np.ndarray]:
             listed = (ctypes.c_void_p * count).from_address(addresses) if count else ()
