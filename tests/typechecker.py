@@ -11,6 +11,7 @@ PUBLIC = next(
     for node in ast.parse(INIT.read_text()).body
     if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
 )
+PUBLIC |= {"bar", "cactus", "cylinder", "octopus", "square"}  # jd.shapes
 
 
 def check(function):

@@ -183,7 +183,7 @@ def _sums(row, values, n: int) -> np.ndarray:
     return np.stack([np.bincount(row, column, n) for column in values.T], axis=1)
 
 
-def _grow(p, poses, graph, seed: int, reach: float, allowed) -> RigidGroup | None:
+def _grow(p, poses, graph, seed: int | np.integer, reach: float, allowed) -> RigidGroup | None:
     """Grow a group from the 1-ring of its seed; None if the group loses that ring."""
     ring = np.append(graph[[seed]].indices, seed)
     members = ring

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FD, ends
+from helpers import FD, ends, held_sheet
 
 import jaxdeform as jd
 
@@ -54,3 +54,31 @@ def test_sparse_factor_under_jit_vmap_grad():
         h = 1e-4 * r
         np.testing.assert_allclose(batch[0][k], loss(r), rtol=1e-9)
         np.testing.assert_allclose(batch[1][k], (loss(r + h) - loss(r - h)) / (2 * h), rtol=FD)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("local", "solver"),
+    [
+        (jd.Newton(), jd.QuasiNewton(tolerance=1e-15)),
+        (jd.Newton(), jd.Alternating(20)),
+        (jd.RotationFit(), jd.QuasiNewton(tolerance=1e-15)),
+    ],
+    ids=["implicit", "unrolled", "rotation"],
+)
+def test_second_derivatives_are_the_differences_of_the_first(local, solver):
+    """To the height of a target and the logarithm of the rigidity; forward over reverse."""
+    mesh, handles, targets = held_sheet()
+    problem = jd.precompute(mesh, handles)
+    upper = jnp.asarray((targets[:, 2] > 0).astype(float))[:, None] * jnp.eye(3)[2][None]
+
+    def loss(x):
+        moved = jnp.asarray(targets) + x[0] * upper
+        out = jd.deform(problem, moved, jnp.exp(x[1]), local=local, solver=solver)
+        return jnp.sum(out.vertices**2) + out.energy[-1]
+
+    slope = jax.jit(jax.grad(loss))
+    x, h = jnp.asarray([0.2, -0.5]), 1e-4
+    numeric = np.stack([(slope(x + h * d) - slope(x - h * d)) / (2 * h) for d in jnp.eye(2)])
+    found = jax.jit(jax.hessian(loss))(x)
+    np.testing.assert_allclose(found, numeric, rtol=FD, atol=FD * np.abs(numeric).max())

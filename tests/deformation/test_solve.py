@@ -187,7 +187,9 @@ def bad_calls(bar, problem, targets):
         ),
         "rigidity has shape": lambda: jd.deform(problem, targets, [1.0, 2.0]),
         "start have shape": lambda: jd.deform(problem, targets, 1.0, start=targets),
-        "0 steps": lambda: jd.deform(problem, targets, 1.0, solver=jd.Alternating(0)),
+        "steps of Alternating is 0": lambda: jd.deform(
+            problem, targets, 1.0, solver=jd.Alternating(0)
+        ),
         "Unrolled": lambda: jd.deform(
             problem, targets, 1.0, solver=jd.QuasiNewton(), adjoint=jd.Unrolled()
         ),

@@ -149,7 +149,7 @@ def test_command_refuses_what_does_not_fit(monkeypatch, tmp_path, capsys, bar):
     (tmp_path / "words.json").write_text('["soft"]')
     out.write_text("kept")
     for arguments, message in (
-        ([rest, other, "-o", out], "other.ply: is no pose of"),
+        ([rest, other, "-o", out], "other.ply: is not a pose of"),
         ([rest, rest, "-o", tmp_path / "out.obj"], "only PLY"),
         ([rest, rest, "-o", out, "--parts", tmp_path / "short.txt"], "parts have shape"),
         ([rest, rest, "-o", out, "--parts", tmp_path / "words.json"], "one integer per vertex"),
