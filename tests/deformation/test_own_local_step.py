@@ -94,7 +94,6 @@ class OldProtocol(Corotated):
     def minimize(self, c, b): ...
 
 
-@dataclass
 class Unhashable(Corotated):
     __hash__ = None
 
