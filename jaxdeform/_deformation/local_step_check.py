@@ -23,7 +23,7 @@ _METHODS = {
 }
 
 
-def check_local_step(local: LocalStep) -> None:
+def check_local_step(local: object) -> None:
     """Raise InputError unless this is a local step that can be called."""
     name = type(local).__name__
     if isinstance(local, str):
