@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 
 
 def draw(curves: dict[str, dict[str, tuple[list, list]]], folder: Path) -> list[Path]:
-    """Write one PNG per kind of curve that was measured."""
+    """Write a PNG of energy against time and one of time against size, where they were measured."""
     written = []
     loads = [name for name in curves if name != "size"]
     if loads:

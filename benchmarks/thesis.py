@@ -1,9 +1,9 @@
 """The thesis's way in NumPy: one vertex after the other, gradient descent on Eq. 4.3.
 
-Written as chapter 4 describes it, and not worse: everything that does not change (edges, weights,
-B, the factor of A) is computed once, and each vertex's C is one matrix product. The step is one
-over a bound on the curvature, the safe choice where the thesis names none; the descent of a vertex
-ends after 100 steps or when its gradient is below 1e-4 of the cell's size.
+It is what chapter 4 describes, made no slower: everything that does not change (edges, weights, B,
+the factor of A) is computed once, and each vertex's C is one matrix product. The step is one over a
+bound on the curvature, the safe choice where the thesis names none. The descent of a vertex ends
+after 100 steps, or when its gradient is below 1e-4 of the size of the cell's coefficients.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ class ThesisDeformation:
         self.solve = scipy.sparse.linalg.factorized(a[self.free][:, self.free].tocsc())
 
     def affine_fits(self, p: np.ndarray) -> list[np.ndarray]:
-        """Eq. 4.6, the thesis's start of T (a pseudo-inverse, since flat cells have no inverse)."""
+        """Eq. 4.6, the thesis's start of T. Flat cells have no inverse, hence pinv."""
         moved = p[self.ends[0]] - p[self.ends[1]]
         return [
             np.linalg.pinv(b) @ (w.T @ moved[e])

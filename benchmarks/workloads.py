@@ -1,4 +1,4 @@
-"""Meshes with handles, targets and a common start; the peers that solve them."""
+"""Meshes with handles, targets and a common start, and libigl to deform them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,9 +8,19 @@ import numpy as np
 
 import jaxdeform as jd
 
+MATERIAL = 0.2
+"""The scale-free material constant of suites that name no rigidity."""
+
+
+def material(problem: jd.Problem):
+    """Return the rigidity (vertices,) of that material."""
+    return jd.rigidity_from_material(problem, MATERIAL)
+
 
 @dataclass(frozen=True, eq=False)
 class Workload:
+    """One deformation: a mesh, its handles and where they go."""
+
     name: str
     mesh: jd.Mesh
     handles: np.ndarray
@@ -18,10 +28,17 @@ class Workload:
 
     @cached_property
     def start(self) -> np.ndarray:
-        """The first guess that all methods get: Laplacian editing."""
+        """The start that all methods get: Laplacian editing."""
         return np.array(jd.laplacian_editing(self.mesh, self.handles, self.targets))
 
+    def reduced_energy(self, problem: jd.Problem, vertices, rigidity, local: jd.LocalStep) -> float:
+        """Return min over T of Eq. 4.4 at given positions: one functional for every method."""
+        once = jd.Alternating(1)
+        out = jd.deform(problem, self.targets, rigidity, local=local, start=vertices, solver=once)
+        return float(out.energy[0])
+
     def libigl(self, steps: int) -> igl.ARAPData:
+        """Precompute ARAP as libigl does."""
         data = igl.ARAPData()
         data.energy = igl.ARAPEnergyType.ARAP_ENERGY_TYPE_SPOKES
         data.max_iter = steps
@@ -29,6 +46,7 @@ class Workload:
         return data
 
     def run_libigl(self, data: igl.ARAPData, steps: int, start=None) -> np.ndarray:
+        """Return the positions after that many iterations of libigl's ARAP."""
         data.max_iter = steps
         return np.asarray(
             igl.arap_solve(self.targets, data, (self.start if start is None else start).copy())
@@ -42,6 +60,7 @@ def bar() -> Workload:
 
 
 def cylinder() -> Workload:
+    """A closed cylinder bent by 90 degrees: 4,802 vertices."""
     mesh = jd.shapes.cylinder()
     y = mesh.vertices[:, 1]
     return _bent("cylinder", mesh, (y < 0.5) | (y > 11.5))
@@ -71,7 +90,7 @@ def tube(vertices: int) -> Workload:
 
 
 def fine_tube(vertices: int) -> jd.Mesh:
-    """Rings of m vertices, about 6 m of them, so that the triangles are nearly equilateral."""
+    """Return about 6 m rings of m vertices each, so that triangles are nearly equilateral."""
     m = max(8, round((vertices / 6) ** 0.5))
     along = round(vertices / m)
     angle = 2 * np.pi * np.arange(m) / m
@@ -84,8 +103,8 @@ def fine_tube(vertices: int) -> jd.Mesh:
     return jd.Mesh((ring[None] + height).reshape(-1, 3), np.concatenate([low, high]))
 
 
-def _bent(name: str, mesh: jd.Mesh, held: np.ndarray, degrees: float = 90.0) -> Workload:
-    handles = np.flatnonzero(held)
+def _bent(name: str, mesh: jd.Mesh, at_ends: np.ndarray, degrees: float = 90.0) -> Workload:
+    handles = np.flatnonzero(at_ends)
     return Workload(name, mesh, handles, np.asarray(jd.bend(mesh.vertices[handles], degrees)))
 
 

@@ -1,66 +1,60 @@
 """jaxdeform: differentiable mesh deformation in JAX, every part with its own rigidity."""
 
-from jaxdeform import shapes
-from jaxdeform.deformation import (
-    Alternating,
-    Implicit,
-    Problem,
-    QuasiNewton,
-    Result,
-    Solution,
-    Unrolled,
-    deform,
-    energy,
-    material,
-    precompute,
+from jaxdeform._baselines.cages import mean_value_coordinates
+from jaxdeform._baselines.laplacian_editing import (
+    LaplacianEditor,
+    laplacian_editing,
+    laplacian_editor,
 )
-from jaxdeform.estimation import (
-    Estimate,
-    FieldEstimate,
-    RigidGroup,
-    ThesisEstimate,
-    estimate_rigidity,
-    estimate_rigidity_field,
-    estimate_rigidity_thesis,
-    find_handle_groups,
-    find_handles,
-)
-from jaxdeform.handles import HandleFile, load_handles, rigid_targets
-from jaxdeform.laplacian import cotangent_weights
-from jaxdeform.laplacian_editing import LaplacianEditor, laplacian_editing, laplacian_editor
-from jaxdeform.local_step import LBFGS, AffineFit, GradientDescent, Newton, RotationFit
-from jaxdeform.mesh import (
-    InputError,
-    Inspection,
-    Mesh,
-    check_output,
-    inspect,
-    load_mesh,
-    load_rigidity,
-    repair,
-    save_mesh,
-)
-from jaxdeform.neighborhood import Cells, rings, spokes
-from jaxdeform.pictures import picture
-from jaxdeform.shapes import bend, rotate, translate, twist
-from jaxdeform.skinning import (
-    Skeleton,
-    bounded_biharmonic_weights,
+from jaxdeform._baselines.skeletons import Skeleton, load_skeleton
+from jaxdeform._baselines.skinning import (
     dual_quaternion_skinning,
+    linear_blend_skinning,
+    rigid_transforms,
+)
+from jaxdeform._baselines.skinning_weights import (
+    bounded_biharmonic_weights,
     geodesic_distances,
     inverse_distance_weights,
-    linear_blend_skinning,
-    load_skeleton,
-    mean_value_coordinates,
-    rigid_transforms,
     rigid_weights,
 )
-from jaxdeform.submesh import Part, cut
+from jaxdeform._deformation.adjoint import Implicit, Unrolled
+from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.local_step import (
+    LBFGS,
+    AffineFit,
+    GradientDescent,
+    LocalStep,
+    Newton,
+    RotationFit,
+)
+from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
+from jaxdeform._deformation.quasi_newton import QuasiNewton
+from jaxdeform._deformation.solve import Solution, deform, energy
+from jaxdeform._errors import InputError
+from jaxdeform._estimation.field import FieldEstimate, estimate_rigidity_field
+from jaxdeform._estimation.parts import Estimate, estimate_rigidity
+from jaxdeform._estimation.rigid_groups import RigidGroup, find_handle_groups, find_handles
+from jaxdeform._estimation.thesis import ThesisEstimate, estimate_rigidity_thesis
+from jaxdeform._handles.files import HandleFile, load_handles
+from jaxdeform._handles.rigid import rigid_targets
+from jaxdeform._handles.targets import bend, rotate, translate, twist
+from jaxdeform._mesh import shapes
+from jaxdeform._mesh.cells import Cells, rings, spokes
+from jaxdeform._mesh.files import load_mesh, load_rigidity, save_mesh
+from jaxdeform._mesh.inspection import Inspection, inspect, repair
+from jaxdeform._mesh.laplacian import cotangent_weights
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.submesh import Submesh, submesh
+from jaxdeform._plotting import render
+from jaxdeform._result import Result
 
 __version__ = "0.1.0"  # pyproject.toml reads it from here
 
 __all__ = [
     "LBFGS",
+    "Adjoint",
     "AffineFit",
     "Alternating",
     "Cells",
@@ -72,9 +66,9 @@ __all__ = [
     "InputError",
     "Inspection",
     "LaplacianEditor",
+    "LocalStep",
     "Mesh",
     "Newton",
-    "Part",
     "Problem",
     "QuasiNewton",
     "Result",
@@ -82,13 +76,13 @@ __all__ = [
     "RotationFit",
     "Skeleton",
     "Solution",
+    "Solver",
+    "Submesh",
     "ThesisEstimate",
     "Unrolled",
     "bend",
     "bounded_biharmonic_weights",
-    "check_output",
     "cotangent_weights",
-    "cut",
     "deform",
     "dual_quaternion_skinning",
     "energy",
@@ -107,19 +101,20 @@ __all__ = [
     "load_mesh",
     "load_rigidity",
     "load_skeleton",
-    "material",
     "mean_value_coordinates",
-    "picture",
     "precompute",
+    "render",
     "repair",
     "rigid_targets",
     "rigid_transforms",
     "rigid_weights",
+    "rigidity_from_material",
     "rings",
     "rotate",
     "save_mesh",
     "shapes",
     "spokes",
+    "submesh",
     "translate",
     "twist",
 ]

@@ -1,6 +1,4 @@
-"""Shared set-up: strict JAX, named tolerances, real meshes."""
-
-from pathlib import Path
+"""Shared set-up: strict JAX, shapes checked at every call, and the fixtures."""
 
 import jax
 import numpy as np
@@ -11,42 +9,12 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# The annotations of the floors that take plain arrays are checked at every call. Not those of the
-# public functions: they take whatever numpy can read (at run time no type says so), and misuse
-# must reach their own checks.
-install_import_hook(
-    [
-        f"jaxdeform.{name}"
-        for name in ("formats", "laplacian", "energy", "nested_dissection", "global_step")
-    ],
-    "beartype.beartype",
-)
+# The annotations of every module are checked at every call (typechecker.py).
+install_import_hook("jaxdeform", "typechecker.check")
+
+from helpers import THESIS, ends  # noqa: E402
 
 import jaxdeform as jd  # noqa: E402 (after x64 and the hook)
-
-EXACT = 1e-10
-"""float64 algebra."""
-PEER = 1e-6
-"""libigl: its rotations are float32."""
-FD = 1e-4
-"""Central differences, relative."""
-
-REAL = Path(__file__).parents[2] / "shared" / "meshes"
-
-
-def real_mesh(name: str) -> jd.Mesh:
-    """Return one of the real meshes, or skip where they are not at hand."""
-    path = REAL / name
-    if not path.exists():
-        pytest.skip(f"{name} is not shipped with the project (needs {path.parent.name}/ beside it)")
-    return jd.load_mesh(path)
-
-
-def ends(mesh: jd.Mesh, part: float = 0.04, along: int = 1) -> np.ndarray:
-    """Return the vertices at both ends along an axis, y if left out."""
-    y = mesh.vertices[:, along]
-    height = (y - y.min()) / np.ptp(y)
-    return np.flatnonzero((height < part) | (height > 1 - part))
 
 
 @pytest.fixture(scope="session")
@@ -62,3 +30,23 @@ def bar_problem(bar: jd.Mesh) -> jd.Problem:
 @pytest.fixture(scope="session")
 def bar_targets(bar: jd.Mesh, bar_problem: jd.Problem) -> np.ndarray:
     return np.asarray(jd.bend(bar.vertices[bar_problem.handles], 90.0))
+
+
+@pytest.fixture
+def odd() -> jd.Mesh:
+    """An open strip whose coordinates need all their bits."""
+    v = np.random.default_rng(0).normal(size=(8, 3)) * [1e-7, 1.0, 1e7]
+    return jd.Mesh(v, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6], [5, 7, 6]])
+
+
+@pytest.fixture(scope="session")
+def pose_of(bar_problem: jd.Problem, bar_targets: np.ndarray):
+    """Return poses of the bent bar by rigidity, compiled once."""
+    return lambda rigidity: np.asarray(
+        jd.deform(bar_problem, bar_targets, rigidity, solver=THESIS).vertices
+    )
+
+
+@pytest.fixture(scope="session")
+def halves(bar: jd.Mesh) -> np.ndarray:
+    return (bar.vertices[:, 1] > 75).astype(int)

@@ -7,18 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import EXACT, FD
+from helpers import EXACT, FD
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
 
 PAGE = (Path(__file__).parents[1] / "docs" / "derivatives.md").read_text(encoding="utf-8")
-
-pytestmark = pytest.mark.skipif(
-    not hasattr(jd.RotationFit, "with_implicit_derivative"),
-    reason="the page is written for the names to come",
-)
 
 
 def block(name: str, until: str | None = None) -> dict:

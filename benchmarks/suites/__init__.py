@@ -1,0 +1,34 @@
+"""The suites by name, in the order in which they run. Each takes ``quick``, returns Findings."""
+
+from collections.abc import Callable
+
+from benchmarks.metrics import Findings
+from benchmarks.suites import (
+    batch,
+    cactus,
+    convergence,
+    derivatives,
+    dragging,
+    factors,
+    iteration,
+    local_steps,
+    memory,
+    scaling,
+    startup,
+    thesis,
+)
+
+SUITES: dict[str, Callable[[bool], Findings]] = {
+    "iteration": iteration.run,
+    "cactus": cactus.run,
+    "convergence": convergence.run,
+    "thesis": thesis.run,
+    "local_steps": local_steps.run,
+    "factors": factors.run,
+    "startup": startup.run,
+    "dragging": dragging.run,
+    "batch": batch.run,
+    "scaling": scaling.run,
+    "memory": memory.run,
+    "derivatives": derivatives.run,
+}

@@ -1,0 +1,118 @@
+"""Time to come within 1e-4 of the minimum, the same functional evaluated for all."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+import jaxdeform as jd
+from benchmarks import workloads
+from benchmarks.harness import interleaved
+from benchmarks.metrics import Curve, Findings, Metric
+from benchmarks.workloads import Workload
+
+NEAR = 1e-4
+
+
+class Case(NamedTuple):
+    """What is minimised, and the most time it may take, as a fraction of libigl's."""
+
+    name: str
+    problem: jd.Problem
+    rigidity: float
+    local: jd.LocalStep
+    target: float
+
+
+class Ours(NamedTuple):
+    """How QuasiNewton gets near the minimum."""
+
+    run: Callable[[], object]
+    energies: list[float]
+    """After each iteration, relative to the minimum, less 1."""
+
+
+def run(quick: bool) -> Findings:
+    loads = [workloads.bar()]
+    if not quick:
+        loads += [workloads.cylinder(), workloads.cactus()]
+    metrics, curves = [], {}
+    for load in loads:
+        metrics_of, curves[load.name] = _convergence(load, repeats=3 if quick else 7)
+        metrics += metrics_of
+    return Findings(metrics, curves)
+
+
+def _convergence(load: Workload, repeats: int) -> tuple[list[Metric], dict[str, Curve]]:
+    rigid = jd.precompute(load.mesh, load.handles, cells=jd.spokes(load.mesh))
+    problem = jd.precompute(load.mesh, load.handles)
+    cases = [Case("rigid limit", rigid, 0.0, jd.RotationFit(), 0.4)]
+    cases += [Case(f"rigidity {x:g}", problem, x, jd.Newton(), 0.8) for x in (1.0, 0.05)]
+    peer_steps, peer_energies = _libigl_descent(load, rigid)
+    data = load.libigl(peer_steps[-1])
+    ours = {case.name: _our_descent(load, case) for case in cases}
+    runs: dict[str, Callable[[], object]] = {
+        "libigl": lambda: load.run_libigl(data, peer_steps[-1])
+    }
+    seconds = interleaved(runs | {name: x.run for name, x in ours.items()}, repeats)
+    per = seconds["libigl"] / max(1, peer_steps[-1])
+    curves: dict[str, Curve] = {
+        "libigl ARAP, rigid": ([k * per for k in peer_steps], peer_energies)
+    }
+    for name, (_, energies) in ours.items():
+        per = seconds[name] / max(1, len(energies) - 1)
+        curves[f"jaxdeform, {name}"] = ([k * per for k in range(len(energies))], energies)
+    return _metrics(load, cases, seconds, peer_steps[-1]), curves
+
+
+def _metrics(load: Workload, cases: list[Case], seconds, peer_steps: int) -> list[Metric]:
+    out = []
+    for case in cases:
+        label = f"time to within 1e-4 of the minimum, {case.name} / libigl's rigid ARAP"
+        spent = seconds[case.name]
+        out.append(Metric(label, load.name, spent / seconds["libigl"], "1", case.target))
+        out.append(Metric(f"time to within 1e-4, {case.name}", load.name, 1e3 * spent, "ms"))
+    spent, note = 1e3 * seconds["libigl"], f"{peer_steps} iterations"
+    out.append(Metric("time to within 1e-4, libigl", load.name, spent, "ms", note=note))
+    return out
+
+
+def _our_descent(load: Workload, case: Case) -> Ours:
+    """Return QuasiNewton's run to within NEAR of its own minimum."""
+    energy = _energies(load, case.problem, case.rigidity, case.local)
+    least = energy.min()
+    steps = int(np.flatnonzero(energy <= least * (1 + NEAR))[0])
+    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0)
+
+    def run():
+        return jd.deform(
+            case.problem,
+            load.targets,
+            case.rigidity,
+            local=case.local,
+            solver=solver,
+            start=load.start,
+        )
+
+    return Ours(run, (energy[: steps + 1] / least - 1).tolist())
+
+
+def _libigl_descent(load: Workload, problem: jd.Problem) -> tuple[list[int], list[float]]:
+    """Return libigl's iterations until it is as near to the same minimum, and the energies."""
+    local = jd.RotationFit()
+    least = float(_energies(load, problem, 0.0, local)[-1])
+    data = load.libigl(5)
+    p, steps = load.start, [0]
+    energies = [load.reduced_energy(problem, p, 0.0, local) / least - 1]
+    while energies[-1] > NEAR and steps[-1] < 5000:
+        p = load.run_libigl(data, 5, start=p)
+        steps.append(steps[-1] + 5)
+        energies.append(load.reduced_energy(problem, p, 0.0, local) / least - 1)
+    return steps, energies
+
+
+def _energies(load: Workload, problem: jd.Problem, rigidity: float, local: jd.LocalStep):
+    """Return the energy at the start and after each iteration, down to the minimum."""
+    solver = jd.QuasiNewton(tolerance=1e-13, max_steps=3000)
+    out = jd.deform(problem, load.targets, rigidity, local=local, solver=solver, start=load.start)
+    return np.asarray(out.energy)[: int(out.steps) + 1]

@@ -1,0 +1,181 @@
+"""Laplacian mesh editing, the baseline of Eq. 3.2."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxdeform._checks import check_targets, split_handles
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
+from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._mesh.cells import spokes
+from jaxdeform._mesh.laplacian import normalised_laplacian
+from jaxdeform._mesh.mesh import Mesh
+
+
+class LaplacianEditor(eqx.Module):
+    """Laplacian editing, factored for one mesh and handle set; call it with targets (handles, 3).
+
+    Without similarities, the columns of the matrix are the vertices, and the rows of ``pull`` are
+    three right-hand sides. With similarities, the columns are all coordinates, and there is one
+    right-hand side.
+    """
+
+    rest: Float[Array, "vertices 3"]
+    handles: Int[np.ndarray | Array, "handles"]
+    free: Bool[Array, "columns"]
+    """True for each unknown."""
+    soft: Float[Array, "columns"]
+    """The weight of each soft handle; 0 elsewhere."""
+    pull: Float[Array, "rows columns"]
+    """L^T delta, the right-hand side of the details; zero where the matrix rotates the details."""
+    normal: EllMatrix
+    """The matrix of the normal equations."""
+    factor: Factor
+    """The factor of its free-free block."""
+
+    def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
+        """Return the edited positions, differentiable in the targets (handles, 3)."""
+        targets = check_targets(targets, len(self.handles), self.rest.dtype)
+        x = self.rest.at[self.handles].set(targets).T.reshape(self.pull.shape)
+        fixed = jnp.where(self.free[None], 0.0, x)
+        right = self.pull + self.soft[None] * x - self.normal.apply(fixed)
+        solution = self.factor.solve(jnp.where(self.free[None], right, 0.0))
+        return (fixed + solution).reshape(3, -1).T
+
+
+def laplacian_editor(
+    mesh: Mesh,
+    handles: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    handle_weights: ArrayLike = np.inf,
+    similarity: bool = False,
+) -> LaplacianEditor:
+    """Factor Laplacian mesh editing for a mesh and a set of handles (Eq. 3.1, 3.2).
+
+    The editor minimises ``sum_i |(L p')_i - T_i delta_i|^2 + sum_h w_h |p'_h - u_h|^2``.
+
+    Sorkine, Cohen-Or, Lipman, Alexa, Roessl and Seidel, "Laplacian surface editing" (2004),
+    doi:10.1145/1057432.1057456.
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - handles: (handles,), vertex indices.
+    - weights: (edges,), in the order of ``mesh.edges``; by default cotangent weights. ``np.ones``
+      gives the uniform Laplacian.
+    - handle_weights: a number or (handles,). The default, infinity, keeps the handle on its target.
+    - similarity: False keeps T_i = I, so details do not rotate, and large rotations distort them.
+      True makes T_i the linearised similarity that best fits the neighbourhood (Sorkine et al.
+      2004): details rotate with it, up to about 90 degrees. All coordinates are then solved for at
+      once.
+
+    **Returns** a :class:`LaplacianEditor`.
+
+    **Raises** InputError: no handles; a handle out of range or repeated; a connected component
+    without a handle; weights of the wrong shape or not finite; handles that do not determine the
+    shape.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> edit = jd.laplacian_editor(mesh, [0, 1, 300, 721])
+        >>> edit(mesh.vertices[[0, 1, 300, 721]] + 1.0).shape
+        (722, 3)
+    """
+    n = mesh.n_vertices
+    index, free, soft = split_handles(mesh, handles, handle_weights)
+    cells = spokes(mesh, weights=weights)
+    laplacian = normalised_laplacian(cells.edges, cells.weights, n)
+    if similarity:
+        operator = sp.kron(sp.identity(3), laplacian) - _rotated_details(mesh, laplacian)
+        pull = np.zeros((1, 3 * n))
+        free, soft = np.tile(free, 3), np.tile(soft, 3)
+        positions = np.tile(mesh.vertices, (3, 1))
+    else:
+        operator, positions = laplacian, mesh.vertices
+        pull = (laplacian.T @ (laplacian @ mesh.vertices)).T
+    normal = (operator.T @ operator + sp.diags(soft)).tocsr()
+    dtype = np.dtype(jnp.result_type(float))
+    try:
+        factor = factorise(normal, free, dtype, positions=positions)
+    except NotPositiveDefinite as error:
+        raise InputError(
+            "the handles do not determine the shape: give each connected component at least three "
+            "vertices that are not on one line"
+        ) from error
+    return LaplacianEditor(
+        rest=jnp.asarray(mesh.vertices, dtype),
+        handles=index,
+        free=jnp.asarray(free),
+        soft=jnp.asarray(soft, dtype),
+        pull=jnp.asarray(pull, dtype),
+        normal=EllMatrix.build([[normal]], dtype),
+        factor=factor,
+    )
+
+
+def laplacian_editing(
+    mesh: Mesh, handles: ArrayLike, targets: ArrayLike, **settings
+) -> Float[Array, "vertices 3"]:
+    """Edit a mesh by its Laplacian coordinates, once. For many targets use laplacian_editor.
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - handles: (handles,), vertex indices.
+    - targets: (handles, 3), in the unit of the mesh.
+    - settings: those of :func:`laplacian_editor`.
+
+    **Returns** the positions (vertices, 3).
+
+    **Raises** InputError as :func:`laplacian_editor`; also for targets that are not finite or of
+    the wrong shape.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> handles = [0, 1, 300, 721]
+        >>> jd.laplacian_editing(mesh, handles, mesh.vertices[handles]).shape
+        (722, 3)
+    """
+    return laplacian_editor(mesh, handles, **settings)(targets)
+
+
+def _rotated_details(mesh: Mesh, laplacian: sp.csr_matrix) -> sp.csr_matrix:
+    """Return M with ``(M p')_i = T_i(p') delta_i``, where p' holds all x, then all y, then all z.
+
+    ``T_i q = s q + h x q`` fits the centred neighbourhood: ``s = sum q.p' / sum |q|^2`` and
+    ``h = J^-1 sum q x p'`` with ``J = sum |q|^2 I - q q^T``. This is the closed form of Sorkine et
+    al. (2004).
+    """
+    n = mesh.n_vertices
+    delta = laplacian @ mesh.vertices
+    i = np.concatenate([mesh.edges[:, 0], mesh.edges[:, 1], np.arange(n)])
+    j = np.concatenate([mesh.edges[:, 1], mesh.edges[:, 0], np.arange(n)])
+    count = np.bincount(i, minlength=n)
+    center = (
+        np.stack([np.bincount(i, mesh.vertices[j, a], n) for a in range(3)], 1) / count[:, None]
+    )
+    q = mesh.vertices[j] - center[i]
+    square = np.bincount(i, (q**2).sum(axis=1), n)
+    square = np.where(square > 0, square, 1.0)
+    outer = np.zeros((n, 3, 3))
+    np.add.at(outer, i, -q[:, :, None] * q[:, None, :])
+    outer += square[:, None, None] * np.eye(3)
+    inverse = np.linalg.pinv(outer)
+    spin = _cross_matrices(delta)[i] @ inverse[i] @ _cross_matrices(q)
+    block = delta[i][:, :, None] * q[:, None, :] / square[i][:, None, None] - spin
+    rows = i[:, None, None] + n * np.arange(3)[None, :, None] + np.zeros((1, 1, 3), int)
+    columns = j[:, None, None] + n * np.arange(3)[None, None, :] + np.zeros((1, 3, 1), int)
+    return sp.csr_matrix((block.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * n, 3 * n))
+
+
+def _cross_matrices(v: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, "rows 3 3"]:
+    out = np.zeros((len(v), 3, 3))
+    out[:, [2, 0, 1], [1, 2, 0]] = v
+    out[:, [1, 2, 0], [2, 0, 1]] = -v
+    return out

@@ -1,0 +1,69 @@
+"""What a solver and an adjoint are: the two protocols that ``deform`` is put together from."""
+
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float, Int
+
+from jaxdeform._deformation.problem import System
+from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._result import Result
+
+
+class Descent(NamedTuple):
+    """Where a descent ended."""
+
+    positions: Float[Array, "3 vertices"]
+    transforms: Float[Array, "3 3 vertices"]
+    """T_k of every cell at these positions, in its principal axes."""
+    energy: Float[Array, "history"]
+    """At the start and after each step; anything behind the last one."""
+    steps: Int[Array, ""]
+    result: Result
+
+
+@runtime_checkable
+class Adjoint(Protocol):
+    """How derivatives are made: what ``deform(..., adjoint=)`` takes."""
+
+    needs_one_energy: ClassVar[bool]
+    """True if it uses the gradient as that of one energy, which the normal term does not have."""
+
+    def check(self, solver: "Solver") -> None:
+        """Raise InputError if derivatives cannot be made through this solver."""
+        ...
+
+    def solve(
+        self,
+        solver: "Solver",
+        energy: ReducedEnergy,
+        system: System,
+        inputs: Inputs,
+        start: Float[Array, "3 vertices"],
+    ) -> Descent:
+        """Run the solver, so that what comes back has derivatives to the inputs."""
+        ...
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """How the reduced energy is minimised: what ``deform(..., solver=)`` takes."""
+
+    can_unroll: ClassVar[bool]
+    """True if its iterations can be differentiated in forward and reverse mode."""
+    needs_one_energy: ClassVar[bool]
+    """As for an adjoint."""
+
+    @property
+    def default_adjoint(self) -> Adjoint:
+        """The adjoint where the caller names none."""
+        ...
+
+    def minimize(
+        self,
+        energy: ReducedEnergy,
+        system: System,
+        inputs: Inputs,
+        start: Float[Array, "3 vertices"],
+    ) -> Descent:
+        """Iterate from a start, whose fixed vertices are on their targets."""
+        ...

@@ -1,0 +1,209 @@
+"""A mesh with its cells and handles, factored once for every later deformation."""
+
+import dataclasses
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxdeform._checks import HandleSplit, check_rigidity, split_handles
+from jaxdeform._deformation.covariance import CovarianceMap, covariance_map, stiffness
+from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
+from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._mesh.cells import Cells, principal_moments, rings
+from jaxdeform._mesh.laplacian import lifted_weights
+from jaxdeform._mesh.mesh import Mesh
+
+
+class System(eqx.Module):
+    """All that the iterations read. Vertices are the last axis; they alone determine the shapes."""
+
+    rest: Float[Array, "3 vertices"]
+    """Rest positions, moved so that their centre is the origin."""
+    center: Float[Array, "3"]
+    free: Bool[Array, "vertices"]
+    soft: Float[Array, "vertices"]
+    """Weight of each soft handle, 0 elsewhere."""
+    principal_moments: Float[Array, "3 vertices"]
+    principal_axes: Float[Array, "3 3 vertices"]
+    """Columns are the axes: (world axis, principal axis, cell)."""
+    covariance: CovarianceMap
+    stiffness: EllMatrix
+    """A, with the weights of the soft handles on its diagonal."""
+    factor: Factor
+    initial_guess: LaplacianGuess
+    faces: Int[Array, "faces 3"]
+
+
+class Problem(eqx.Module):
+    """A mesh with its cells and handles, factored. Made by :func:`precompute`.
+
+    A problem is a value: a pytree of arrays that can be copied, pickled, written to a file with
+    ``equinox.tree_serialise_leaves``, returned from a jitted function or sent to another process.
+    A factor that is not there yet is made there, from the matrix that the problem holds.
+    """
+
+    system: System
+    """The arrays that the iterations read."""
+    handles: Int[np.ndarray | Array, "handles"]
+    """Indices of the handle vertices, in the order of the targets' rows."""
+    cells: Cells = eqx.field(static=True)
+    """The cells, as they were given (:func:`rings` with r = 1 by default)."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """The rest shape."""
+        return self.cells.mesh
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices."""
+        return self.mesh.n_vertices
+
+    @property
+    def vertices(self) -> Float[np.ndarray, "vertices 3"]:
+        """Rest positions."""
+        return self.mesh.vertices
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of all numbers: float64 where JAX is set to it, else float32."""
+        return np.dtype(self.system.rest.dtype)
+
+    def __repr__(self) -> str:
+        """Return the sizes, not the arrays."""
+        return f"Problem({self.n_vertices} vertices, {len(self.handles)} handles, {self.dtype})"
+
+
+def precompute(
+    mesh: Mesh,
+    handles: ArrayLike,
+    *,
+    cells: Cells | None = None,
+    handle_weights: ArrayLike = np.inf,
+    dtype: np.dtype | type | None = None,
+) -> Problem:
+    """Factor the global step of a mesh and a set of handles, once for every later deformation.
+
+    One factor serves every rigidity, target, member of a batch and gradient, because A depends on
+    the rest mesh, the cells and the handle set only (Eq. 4.5).
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - handles: (handles,) vertex indices, each once.
+    - cells: ``rings(mesh, r)`` or ``spokes(mesh)``; by default ``rings(mesh, 1)``.
+    - handle_weights: a number or (handles,). With the default, infinity, a handle sits on its
+      target. A finite weight w >= 0 pulls with ``w |p' - target|^2`` instead; its unit is that of
+      the edge weights (none).
+    - dtype: float32 or float64; by default float64 where ``jax_enable_x64`` is set.
+
+    **Raises** InputError: no handles; an index out of range or repeated; a connected component of
+    the mesh without a handle (it could lie anywhere); cells of another mesh.
+
+    Unreferenced vertices stay where they are. Where negative cotangent weights make A indefinite,
+    they are lifted to 1e-3 of the mean weight, with a warning.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> y = mesh.vertices[:, 1]
+        >>> handles = ((y < 6) | (y > 145)).nonzero()[0]
+        >>> jd.precompute(mesh, handles).n_vertices
+        722
+    """
+    split = split_handles(mesh, handles, handle_weights)
+    cells = rings(mesh, 1) if cells is None else cells
+    if cells.mesh != mesh:
+        raise InputError(
+            f"cells are of another mesh ({cells.mesh}, not equal to this {mesh}): call "
+            "rings(mesh, r) on this mesh"
+        )
+    dtype = _checked_dtype(dtype)
+    center = mesh.vertices[mesh.referenced].mean(axis=0)
+    rest = mesh.vertices - center
+    used, matrix, factor = _factorise(cells, rest, split, dtype)
+    moments, axes = principal_moments(used)
+    put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
+    system = System(
+        rest=put(rest.T),
+        center=put(center),
+        free=jax.device_put(split.free),
+        soft=put(split.soft),
+        principal_moments=put(moments.T),
+        principal_axes=put(axes.transpose(1, 2, 0)),
+        covariance=covariance_map(used, rest, axes, dtype),
+        stiffness=EllMatrix.build([[sp.csr_matrix(matrix)]], dtype),
+        factor=factor,
+        initial_guess=laplacian_guess(used, split.free & (split.soft == 0), dtype),
+        faces=jax.device_put(mesh.faces.astype(np.int32)),
+    )
+    return Problem(system, split.index, cells)
+
+
+def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
+    kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
+    if kind not in (np.float32, np.float64):
+        raise InputError(f"dtype {kind} is not supported: use float32 or float64")
+    if kind == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise InputError(
+            'dtype float64 needs jax.config.update("jax_enable_x64", True) before anything else'
+        )
+    return kind
+
+
+def _factorise(
+    cells: Cells, rest: Float[np.ndarray, "vertices 3"], split: HandleSplit, dtype: np.dtype
+) -> tuple[Cells, sp.spmatrix, Factor]:
+    """Factor A, with lifted weights if it is indefinite with those of the cells."""
+    matrix = stiffness(cells) + sp.diags(split.soft)
+    try:
+        return cells, matrix, factorise(matrix, split.free, dtype, positions=rest)
+    except NotPositiveDefinite:
+        pass
+    lifted = lifted_weights(cells.weights)
+    raised = int((lifted > cells.weights).sum())
+    cells = dataclasses.replace(cells, weights=lifted)
+    matrix = stiffness(cells) + sp.diags(split.soft)
+    try:
+        factor = factorise(matrix, split.free, dtype, positions=rest)
+    except NotPositiveDefinite as error:
+        raise InputError(
+            "the system of the free vertices is singular even with positive weights: the mesh "
+            "spans too many orders of magnitude; see jd.inspect(mesh) and jd.repair(mesh)"
+        ) from error
+    warnings.warn(
+        f"negative or zero weights made the system indefinite: {raised} edge weights were lifted "
+        f"to {lifted.min():.3g}. Pass weights of your own to rings() or spokes() to decide "
+        "otherwise.",
+        stacklevel=3,
+    )
+    return cells, matrix, factor
+
+
+def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:
+    """Turn a scale-free, resolution-free material constant into the rigidity of each vertex.
+
+    ``lambda_k = constant * tr(B_k) / 2``. The sum of w |e|^2 over a triangle's edges is twice its
+    area, so tr(B_k) / 2 measures the area of the cell. The same constant is the same material on a
+    rescaled or refined mesh; the same lambda is not.
+
+    **Arguments**: problem; constant >= 0, a number or (vertices,), without unit.
+
+    **Returns** (vertices,), length squared. **Raises** InputError as for rigidity.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> problem = jd.precompute(jd.shapes.bar(), [0])
+        >>> jd.rigidity_from_material(problem, 0.2).shape
+        (722,)
+    """
+    constant = check_rigidity(constant, problem.n_vertices, problem.dtype, name="constant")
+    trace = jnp.sum(problem.system.principal_moments, axis=0)
+    return jnp.asarray(constant) * jnp.maximum(trace, 0.0) / 2.0

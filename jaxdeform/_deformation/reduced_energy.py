@@ -1,0 +1,125 @@
+"""The reduced energy E(p') = min over T of E(p', T), its gradient, and the normal term of Eq. 4.7.
+
+By the envelope theorem the gradient is that of E at the minimising T: ``2 (A p' - K^T T(p'))``.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxdeform._deformation.energy import local_energy
+from jaxdeform._deformation.local_step import LocalStep, solve_local_step
+from jaxdeform._deformation.problem import System
+from jaxdeform._linalg.ell import split_batch
+from jaxdeform._linalg.lbfgs import Sample
+from jaxdeform._linalg.xla import total
+
+
+class Inputs(NamedTuple):
+    """What ``deform`` is differentiable in, spread over all vertices."""
+
+    targets: Float[Array, "3 *vertices"]
+    """Target positions at handles, hard and soft; rest positions elsewhere."""
+    rigidity: Float[Array, "*vertices"]
+    soft: Float[Array, "*vertices"]
+    """Weights of the soft handles; by default those of the system, which its factor holds."""
+
+
+@dataclass(frozen=True)
+class ReducedEnergy:
+    """The function that is minimised. A setting, not data: all arrays are arguments."""
+
+    local: LocalStep
+    normals: bool = False
+
+    def evaluate(
+        self,
+        system: System,
+        inputs: Inputs,
+        p: Float[Array, "3 v"],
+        transforms: Float[Array, "3 3 v"] | None = None,
+        batch: int | None = None,
+    ) -> Sample:
+        """Evaluate at p; with transforms, which must be those at p, the local step is not run.
+
+        With a batch, the last axis of p and of the inputs is that of vertices and batch
+        (linalg/ell.py), and there is one energy for each member.
+        """
+        size = batch or 1
+        moments, free, soft = (
+            jnp.repeat(x, size, axis=-1)
+            for x in (system.principal_moments, system.free, system.soft)
+        )
+        c = system.covariance(p, size)
+        if self.normals:
+            t, cells = self._fit_with_normals(system, inputs, p, c, transforms)
+        else:
+            t = self._fit(transforms, c, moments, inputs.rigidity)
+            cells = local_energy(t, c, moments, inputs.rigidity, batch)
+        # The factor holds the system's own weights of soft handles. Other weights enter here only.
+        stiff = system.stiffness.apply(p, size) + (inputs.soft - soft)[None] * p
+        pull = system.covariance.transpose(t, size) + inputs.soft[None] * inputs.targets
+        scale = total(p * stiff, batch)
+        # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
+        springs = inputs.soft[None] * inputs.targets * (inputs.targets - 2.0 * p)
+        energy = scale + total(springs, batch) + cells
+        gradient = jnp.where(free[None], stiff - pull, 0.0)
+        # The energy is a small difference of terms as large as scale, hence its rounding error.
+        rounding = 20.0 * jnp.finfo(p.dtype).eps * jnp.abs(scale)
+        return Sample(t, gradient, energy, rounding)
+
+    def evaluate_batch(
+        self, system: System, inputs: Inputs, p: Float[Array, "3 vertices batch"]
+    ) -> Sample:
+        """Evaluate a batch side by side; all arrays, also those of inputs, have it last."""
+        batch = p.shape[-1]
+        flat = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), (inputs, p))
+        at = self.evaluate(system, *flat, batch=batch)
+        transforms, gradient = (split_batch(x, batch) for x in (at.transforms, at.gradient))
+        return at._replace(transforms=transforms, gradient=gradient)
+
+    def _fit(self, transforms, c, moments, rigidity) -> Float[Array, "3 3 v"]:
+        if transforms is None:
+            return solve_local_step(self.local, c, moments, rigidity)
+        return self.local.with_implicit_derivative(transforms, c, moments, rigidity)
+
+    def _fit_with_normals(self, system: System, inputs: Inputs, p, c, transforms):
+        """Add one edge of weight 1 from n to n', the normal of the current vertices (Eq. 4.7).
+
+        The edge changes B, so here the cells have other principal axes.
+        """
+        einsum = partial(jnp.einsum, precision="highest")
+        rest_normal = vertex_normals(system.rest, system.faces)
+        normal = vertex_normals(p, system.faces)
+        axes = system.principal_axes
+        b = einsum("iak,ak,jak->kij", axes, system.principal_moments, axes)
+        b = b + einsum("ik,jk->kij", rest_normal, rest_normal)
+        moments, new_axes = jnp.linalg.eigh(b)
+        new_axes = new_axes * jnp.sign(jnp.linalg.det(new_axes))[:, None, None]
+        moments, new_axes = moments.T, jnp.moveaxis(new_axes, 0, -1)
+        rotation = einsum("iak,ibk->abk", axes, new_axes)  # from the problem's axes to these
+        c = einsum("abk,ack->bck", rotation, c)
+        c = c + einsum("ibk,ik,ck->bck", new_axes, rest_normal, normal)
+        if transforms is not None:
+            transforms = einsum("cak,abk->cbk", transforms, rotation)
+        t = self._fit(transforms, c, moments, inputs.rigidity)
+        has_normal = jnp.sum(normal * normal, axis=0)
+        cells = local_energy(t, c, moments, inputs.rigidity) + jnp.sum(has_normal)
+        return einsum("cbk,abk->cak", t, rotation), cells
+
+
+def vertex_normals(
+    positions: Float[Array, "3 vertices"], faces: Int[Array, "faces 3"]
+) -> Float[Array, "3 vertices"]:
+    """Return area-weighted unit normals; 0 where a vertex has no face."""
+    a, b, c = (positions[:, faces[:, k]] for k in range(3))
+    face_normal = jnp.cross(b - a, c - a, axis=0)
+    normal = jnp.zeros_like(positions)
+    for k in range(3):
+        normal = normal.at[:, faces[:, k]].add(face_normal)
+    square = jnp.sum(normal**2, axis=0, keepdims=True)
+    return normal / jnp.sqrt(jnp.where(square > 0, square, 1.0))

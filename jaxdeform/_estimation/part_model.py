@@ -1,0 +1,91 @@
+"""What is fitted: deformed poses as a function of one log rigidity per part."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.problem import Problem, rigidity_from_material
+from jaxdeform._estimation.bounded_gauss_newton import Evaluation
+from jaxdeform._estimation.noise import whiten
+from jaxdeform._estimation.poses import PoseDerivatives, Poses, check_start, deform_all, log_bounds
+
+
+class Fit(NamedTuple):
+    """One evaluation: the poses at log rigidity theta, and the linear model there."""
+
+    theta: Float[np.ndarray, "parts"]
+    vertices: Float[np.ndarray, "poses vertices 3"]
+    jacobian: Float[np.ndarray, "poses vertices 3 parts"]
+    residual: Float[np.ndarray, "poses vertices 3"]
+    triangle: Float[np.ndarray, "rows columns"]
+    """R of the QR decomposition of W^(1/2) [J, r]: all that a search needs of the equations."""
+
+    @property
+    def normal(self) -> Float[np.ndarray, "parts parts"]:
+        """J^T W J."""
+        return self.triangle[:, :-1].T @ self.triangle[:, :-1]
+
+    @property
+    def cost(self) -> float:
+        """r^T W r."""
+        return float(self.triangle[:, -1] @ self.triangle[:, -1])
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """The linear model as the search takes it."""
+        matrix = lx.MatrixLinearOperator(jnp.asarray(self.triangle[:, :-1]))
+        return Evaluation(jnp.asarray(self.theta), jnp.asarray(self.triangle[:, -1]), matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class PartModel:
+    """The deformations that are compared with the poses."""
+
+    problem: Problem
+    poses: Poses
+    label: Int[np.ndarray, "vertices"]
+    """The part of each vertex."""
+    solver: Solver
+    adjoint: Adjoint
+    size: Float[np.ndarray, "parts"]
+    """Rigidity of each part at material constant 1."""
+
+    @classmethod
+    def build(cls, problem, poses, label, solver, adjoint) -> "PartModel":
+        """Measure the parts: a part is as large as its typical cell."""
+        scale = np.asarray(rigidity_from_material(problem, 1.0), np.float64)
+        size = np.array([np.median(scale[label == k]) for k in range(label.max() + 1)])
+        # Cells without area must have a size too.
+        size = np.where(size > 0, size, scale.mean())
+        return cls(problem, poses, label, solver, adjoint, size)
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 parts"]:
+        """Lowest and highest log rigidity."""
+        return log_bounds(self.size)
+
+    def start(self, given) -> Float[np.ndarray, "parts"]:
+        """Return the log rigidity to start from: that given, or a medium material."""
+        return np.clip(np.log(check_start(given, 0.1 * self.size)), *self.bounds)
+
+    def field(self, theta: np.ndarray) -> Float[np.ndarray, "vertices"]:
+        """Return the rigidity of each vertex."""
+        return np.exp(theta)[self.label]
+
+    def fit(self, theta: np.ndarray, modes: np.ndarray | None) -> Fit:
+        """Deform into all poses; ``modes`` are those of the handles' noise, if it counts."""
+        found = deform_all(self.problem, self.poses, self.label, theta, self.solver, self.adjoint)
+        return self.weighted(theta, found, modes)
+
+    def weighted(self, theta, derivatives: PoseDerivatives | Fit, modes) -> Fit:
+        """Return the linear model with the weights of these modes."""
+        jacobian, residual = np.asarray(derivatives.jacobian), np.asarray(derivatives.residual)
+        columns = np.concatenate([jacobian, residual[..., None]], axis=-1, dtype=np.float64)
+        columns = whiten(columns.reshape(len(residual), -1, len(theta) + 1), modes)
+        triangle = np.asarray(np.linalg.qr(columns.reshape(-1, len(theta) + 1), mode="r"))
+        return Fit(theta, np.asarray(derivatives.vertices), jacobian, residual, triangle)

@@ -1,0 +1,153 @@
+"""Observed poses: checks, and what separates deformed poses from them."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxdeform._checks import as_array, check_positions, check_rigidity
+from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.solve import deform
+from jaxdeform._errors import InputError
+
+# Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
+# bar moves by less than 1e-6 of its size from there to zero and to infinity.
+_SOFTEST, _STIFFEST = 1e-7, 1e5
+# Positions closer than this fraction of the bounding box diagonal are the same: float32 files round
+# to it, and the solvers stop there.
+_EQUAL = 1e-8
+
+
+class Poses(NamedTuple):
+    """The observed poses, as compiled functions take them."""
+
+    targets: Float[np.ndarray, "poses handles 3"]
+    observed: Float[np.ndarray, "poses vertices 3"]
+    counted: Bool[np.ndarray, "poses vertices"]
+    """Vertices that are free and were seen; the others' positions are 0 in ``observed``."""
+
+    @property
+    def count(self) -> int:
+        """Number of coordinates compared."""
+        return 3 * int(np.sum(self.counted))
+
+    def root_mean_square(self, residual: Float[np.ndarray, "poses vertices 3"]) -> float:
+        """Return the misfit: a length."""
+        return float(np.sqrt(np.sum(residual**2) / max(self.count, 1)))
+
+
+class PoseDerivatives(NamedTuple):
+    """Deformed poses and their derivatives with respect to log rigidity."""
+
+    vertices: Float[Array, "poses vertices 3"]
+    jacobian: Float[Array, "poses vertices 3 parts"]
+    """0 at vertices that do not count."""
+    residual: Float[Array, "poses vertices 3"]
+    """0 at vertices that do not count."""
+
+
+def diagonal(problem: Problem) -> float:
+    """Return the length of the bounding box diagonal of the rest shape."""
+    return problem.mesh.diagonal
+
+
+def same_length(problem: Problem) -> float:
+    """Return the length below which positions are the same."""
+    return _EQUAL * diagonal(problem)
+
+
+def log_bounds(size: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "2 unknowns"]:
+    """Return the range of log rigidity, for materials whose constant 1 has these rigidities."""
+    return np.log([_SOFTEST * size, _STIFFEST * size])
+
+
+def deformed(problem: Problem, targets, field, solver, adjoint) -> Float[Array, "poses vertices 3"]:
+    """Deform into each pose, one after the other: so each ends its own loops early."""
+    pose = lambda t: deform(problem, t, field, solver=solver, adjoint=adjoint).vertices  # noqa: E731
+    return jax.lax.map(pose, targets)
+
+
+@partial(jax.jit, static_argnames=("solver", "adjoint"))
+def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDerivatives:
+    """Deform into all poses, with derivatives in forward mode, all parts at once."""
+
+    def run(theta):
+        return deformed(problem, poses.targets, jnp.exp(theta)[label], solver, adjoint)
+
+    push = lambda direction: jax.jvp(run, (theta,), (direction,))  # noqa: E731
+    vertices, jacobian = jax.vmap(push, out_axes=(None, -1))(jnp.eye(len(theta), dtype=theta.dtype))
+    jacobian = jnp.where(poses.counted[..., None, None], jacobian, 0.0)
+    return PoseDerivatives(vertices, jacobian, residual_of(poses, vertices))
+
+
+def residual_of(poses: Poses, vertices) -> Float[Array, "poses vertices 3"]:
+    """Return deformed minus observed positions, 0 at vertices that do not count."""
+    return jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
+
+
+# ---------------------------------------------------------------- checks
+
+
+def check_poses(problem: Problem, observed: Any, targets: Any, mask: Any) -> Poses:
+    """Return the poses, or raise InputError naming what is wrong."""
+    n = problem.n_vertices
+    given = np.asarray(as_array(observed, problem.dtype, "observed"))
+    if given.ndim == 2:
+        given = given[None]
+    if given.ndim != 3 or given.shape[1:] != (n, 3) or not len(given):
+        raise InputError(
+            f"observed has shape {np.shape(observed)}: give one pose ({n}, 3) or several "
+            f"(poses, {n}, 3) of the same mesh as the rest shape"
+        )
+    seen = _check_mask(mask, len(given), n)
+    bad = np.argwhere(seen & ~np.isfinite(given).all(axis=2))
+    if len(bad):
+        pose, vertex = bad[0]
+        raise InputError(
+            f"vertex {vertex} of observed pose {pose} is {given[pose, vertex].tolist()} "
+            f"({len(bad)} such): mark what was not seen with mask"
+        )
+    goal = _check_targets(problem, targets, given, seen)
+    counted = seen & np.asarray(problem.system.free)
+    return Poses(goal, np.where(counted[..., None], given, 0.0).astype(problem.dtype), counted)
+
+
+def _check_mask(mask: Any, poses: int, n: int) -> Bool[np.ndarray, "poses vertices"]:
+    seen = np.ones((poses, n), bool) if mask is None else np.asarray(mask)
+    if seen.dtype != bool or seen.shape not in ((n,), (poses, n)):
+        raise InputError(
+            f"mask has shape {seen.shape} and type {seen.dtype}: give booleans ({n},) or "
+            f"({poses}, {n}), True where a vertex was seen"
+        )
+    return np.broadcast_to(seen, (poses, n))
+
+
+def _check_targets(problem, targets, given, seen) -> Float[np.ndarray, "poses handles 3"]:
+    """Return the targets given, or the observed positions of the handles."""
+    handles, dtype = problem.handles, problem.dtype
+    if targets is None:
+        hidden = np.argwhere(~seen[:, handles])
+        if len(hidden):
+            pose, row = hidden[0]
+            raise InputError(
+                f"handle {handles[row]} was not seen in pose {pose} (mask): give targets, or leave "
+                "it out of the handles"
+            )
+        return given[:, handles]
+    goal = np.asarray(as_array(targets, dtype, "targets"))
+    goal = goal[None] if goal.ndim == 2 else goal
+    shape = (len(given), len(handles), 3)
+    return np.asarray(check_positions("targets", goal, shape, dtype, unit="pose"))
+
+
+def check_start(start: Any, default: np.ndarray) -> Float[np.ndarray, "unknowns"]:
+    """Return the rigidities to start from, or raise InputError naming what is wrong."""
+    if start is None:
+        return default
+    values = np.asarray(check_rigidity(start, len(default), np.dtype(float), name="start"))
+    if (values <= 0).any():
+        raise InputError("start must be above 0, because the search runs on its logarithm")
+    return values

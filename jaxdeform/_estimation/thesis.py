@@ -1,0 +1,75 @@
+"""Algorithm 1 of the thesis, for comparison."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.descent import Solver
+from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.solve import deform
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._estimation.poses import check_poses, residual_of
+from jaxdeform._result import Result
+
+
+class ThesisEstimate(NamedTuple):
+    """What :func:`estimate_rigidity_thesis` returns."""
+
+    rigidity: float
+    path: Float[np.ndarray, "evaluations"]
+    """Rigidity at each evaluation."""
+    history: Float[np.ndarray, "evaluations"]
+    """Frobenius norm of the difference at each."""
+    result: Result
+
+
+def estimate_rigidity_thesis(
+    problem: Problem,
+    observed: ArrayLike,
+    *,
+    targets: ArrayLike | None = None,
+    step_size: float = 0.01,
+    threshold: float = 1e-3,
+    start: float = 1e-6,
+    solver: Solver = Alternating(steps=100),  # noqa: B008 (frozen)
+    max_evaluations: int = 1000,
+) -> ThesisEstimate:
+    """Algorithm 1 of the thesis as written, for comparison: one rigidity, one pose.
+
+    Adds ``step_size * |deformed - observed|_F`` until the relative change of rigidity is less than
+    ``threshold``. It can only increase rigidity. It stops when a step is small compared to
+    rigidity, whether the misfit is small or not. The thesis names neither step size nor threshold.
+
+    **Arguments**: as :func:`estimate_rigidity`; step_size (length), threshold and start as above.
+
+    **Returns** a :class:`ThesisEstimate`. **Raises** InputError as there.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.square()
+        >>> problem = jd.precompute(mesh, [0, 1, 2, 6, 7, 8])
+        >>> targets = jd.twist(mesh.vertices[problem.handles], 60.0, along="y")
+        >>> pose = jd.deform(problem, targets, 0.5).vertices
+        >>> bool(jd.estimate_rigidity_thesis(problem, pose).rigidity < 0.4)
+        True
+    """
+    poses = check_poses(problem, observed, targets, None)
+    if len(poses.targets) != 1:
+        raise InputError("Algorithm 1 takes one pose: call it for each, and take the largest")
+    rigidity, path, history = float(start), [], []
+    for _ in range(max_evaluations):
+        vertices = deform(problem, poses.targets[0], rigidity, solver=solver).vertices
+        path.append(rigidity)
+        history.append(float(jnp.linalg.norm(residual_of(poses, vertices[None]))))
+        if not np.isfinite(history[-1]):
+            return ThesisEstimate(
+                rigidity, np.array(path), np.array(history), Result.fit_not_finite
+            )
+        step = step_size * history[-1]
+        rigidity += step
+        if step / rigidity < threshold:
+            return ThesisEstimate(rigidity, np.array(path), np.array(history), Result.settled)
+    return ThesisEstimate(rigidity, np.array(path), np.array(history), Result.evaluation_limit)

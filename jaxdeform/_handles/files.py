@@ -1,0 +1,180 @@
+"""Handle files: JSON, and the .sel/.def pairs of the survey of Botsch and Sorkine (2008)."""
+
+import json
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from jaxdeform._checks import check_handles
+from jaxdeform._errors import InputError
+from jaxdeform._mesh.mesh import Mesh
+
+
+class HandleFile(NamedTuple):
+    """Handles and their targets, as a file gives them."""
+
+    handles: Int[np.ndarray, "handles"]
+    """Vertex indices."""
+    targets: Float[np.ndarray, "handles 3"]
+    """Where each handle moves to, in the unit of the mesh."""
+
+
+def load_handles(
+    path: str | os.PathLike, mesh: Mesh, motion: str | os.PathLike | None = None
+) -> HandleFile:
+    """Read handles and their targets from a file.
+
+    There are two formats:
+
+    - ``.json``: ``{"handles": [{"vertices": [0, 1], ...}, ...]}``. A group may have
+      ``"rotation": {"axis": [0, 1, 0], "degrees": 90, "center": [0, 0, 0]}`` (by default the centre
+      is the centroid of the group), ``"translation": [1, 0, 0]``, or both, or instead
+      ``"targets": [[x, y, z], ...]``. A group with none of them stays where it is.
+    - ``.sel`` with ``.def``: one number per vertex (0 fixed, 1 free, 2 handle), and the 4x4 matrix
+      of the handle. Format of Botsch and Sorkine, "On linear variational surface deformation
+      methods" (2008), doi:10.1109/TVCG.2007.1054.
+
+    **Arguments**
+
+    - path: a ``.json`` or ``.sel`` file.
+    - mesh: its rest positions are what the motions apply to.
+    - motion: the ``.def`` file; by default the one with the name of the ``.sel`` file.
+
+    **Returns** a :class:`HandleFile`: handles (handles,) and targets (handles, 3).
+
+    **Raises** InputError naming the file, and the group or vertex.
+
+    Example:
+        >>> import jaxdeform as jd, json, pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "handles.json"
+        >>> _ = path.write_text(json.dumps({"handles": [{"vertices": [0, 1]}]}))
+        >>> jd.load_handles(path, jd.shapes.bar()).handles
+        array([0, 1])
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".sel":
+        beside = path.with_suffix(".def") if motion is None else Path(motion)
+        handles, targets = _parse_survey(path, beside, mesh)
+    elif suffix != ".json":
+        raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
+    elif motion is not None:
+        raise InputError(f"{path}: a .json file holds its motions itself: leave out {motion}")
+    else:
+        handles, targets = _parse_json(path, mesh)
+    try:
+        handles = check_handles(handles, mesh.n_vertices)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return HandleFile(handles, targets)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): check the name") from error
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not a text file: give a .json, .sel or .def file") from None
+
+
+def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        content = json.loads(_read_text(path))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: is not valid JSON ({error}): correct it there") from error
+    groups = content.get("handles") if isinstance(content, dict) else None
+    if not isinstance(groups, list) or not groups:
+        raise InputError(f'{path}: give {{"handles": [group, ...]}}, with at least one group')
+    handles, targets = [], []
+    for number, group in enumerate(groups):
+        where = f"{path}: group {number}"
+        if not isinstance(group, dict) or "vertices" not in group:
+            raise InputError(f'{where} has no "vertices": list the vertex indices')
+        _check_keys(where, group, "vertices", "rotation", "translation", "targets", "name")
+        try:
+            index = check_handles(group["vertices"], mesh.n_vertices)
+        except (InputError, ValueError) as error:
+            raise InputError(f"{where}: {error}") from error
+        handles.append(index)
+        targets.append(_moved(where, group, mesh.vertices[index]))
+    return np.concatenate(handles), np.concatenate(targets)
+
+
+def _check_keys(where: str, given: dict, *known: str) -> None:
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise InputError(f"{where} has the unknown key '{unknown[0]}': use {', '.join(known)}")
+
+
+def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
+    if "targets" in group:
+        if "rotation" in group or "translation" in group:
+            raise InputError(f"{where} has targets and a motion: give one of them")
+        return _numbers(where, "targets", group["targets"], points.shape)
+    if "rotation" in group:
+        given = group["rotation"]
+        if not isinstance(given, dict) or "degrees" not in given or "axis" not in given:
+            raise InputError(f'{where}: rotation needs "axis" and "degrees"')
+        _check_keys(f"{where}: rotation", given, "axis", "degrees", "center")
+        axis = _numbers(where, "axis", given["axis"], (3,))
+        length = np.linalg.norm(axis)
+        if length == 0:
+            raise InputError(f"{where}: the rotation axis has length zero: give a direction")
+        degrees = _numbers(where, "degrees", given["degrees"], ())
+        center = points.mean(axis=0)
+        if "center" in given:
+            center = _numbers(where, "center", given["center"], (3,))
+        # SciPy rotates in double precision, whatever JAX is set to.
+        rotation = Rotation.from_rotvec(axis / length * np.radians(degrees))
+        points = rotation.apply(points - center) + center
+    if "translation" in group:
+        points = points + _numbers(where, "translation", group["translation"], (3,))
+    return points
+
+
+def _numbers(where: str, name: str, value, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: {name}: give numbers") from None
+    if array.shape != shape or not np.isfinite(array).all():
+        size = f"{' x '.join(map(str, shape))} finite numbers" if shape else "one finite number"
+        raise InputError(f"{where}: {name}: give {size}")
+    return array
+
+
+def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    status = np.array([word for row in _words(path) for word in row])
+    if len(status) != mesh.n_vertices:
+        raise InputError(
+            f"{path}: has {len(status)} numbers, but the mesh has {mesh.n_vertices} vertices: give "
+            "the file of this mesh"
+        )
+    strange = np.flatnonzero(~np.isin(status, ["0", "1", "2"]))
+    if strange.size:
+        raise InputError(
+            f"{path}: vertex {strange[0]} is '{status[strange[0]]}': give 0 (fixed), 1 (free) or 2 "
+            "(handle)"
+        )
+    matrix = _numbers(str(motion), "the matrix", _words(motion), (4, 4))
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{motion}: the matrix ends in the row {matrix[3].tolist()}: give 0 0 0 1 there, and "
+            "the translation in the last column"
+        )
+    handles = np.flatnonzero(status != "1")
+    targets = mesh.vertices[handles].copy()
+    grabbed = status[handles] == "2"
+    targets[grabbed] = targets[grabbed] @ matrix[:3, :3].T + matrix[:3, 3]
+    return handles, targets
+
+
+def _words(path: Path) -> list[list[str]]:
+    """Return the words of each line; comments and empty lines are left out."""
+    rows = [line.split("#")[0].split() for line in _read_text(path).splitlines()]
+    return [row for row in rows if row]

@@ -1,0 +1,243 @@
+"""Cholesky factors of this process, found by the content of their matrix.
+
+Together they take at most 2 GiB, or the number of bytes in the environment variable
+JAXDEFORM_FACTOR_BYTES. A factor that had to go is made again when it is needed.
+"""
+
+import atexit
+import hashlib
+import os
+import threading
+import weakref
+from collections import Counter, OrderedDict, deque
+from concurrent.futures import Future
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
+from jaxtyping import Array, Bool, Int32, UInt32
+
+# The diagonal of a matrix that only gives a first guess is raised by these parts of itself, one
+# after another, until there is a factor: rounding makes L^T L indefinite where triangles are flat.
+SHIFTS = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)
+
+# What all factors of a process may take together. The one made last stays in any case.
+CAPACITY = int(os.environ.get("JAXDEFORM_FACTOR_BYTES", 2 << 30))
+# What those may take whose problem is gone. They are not freed at once, because JAX does not wait:
+# a deformation may still run when its problem has been collected.
+_LEFT_OVER = 64 << 20
+# A factor takes 5 to 8.4 bytes for each entry of the lower triangle times log2 n (measured for
+# both matrices of 722, 4,802 and 50,298 vertices); the copy of the matrix beside it takes 12.
+_FACTOR_BYTES, _MATRIX_BYTES = 8.5, 12
+
+
+class NotPositiveDefinite(ValueError):
+    """The matrix of the free vertices has no Cholesky factor."""
+
+
+class Matrix(NamedTuple):
+    """A symmetric matrix (vertices, vertices) and which of its unknowns are free, as exact arrays.
+
+    Of the lower triangle, column by column, the whole diagonal and what is not zero below it.
+    """
+
+    starts: Int32[np.ndarray, "columns"]
+    """Where the entries of each column begin, and the end of the last: n + 1."""
+    rows: Int32[np.ndarray, "entries"]
+    values: UInt32[np.ndarray, "entries 2"]
+    """The bits of the float64 values. As numbers JAX would round them to float32 where it is not
+    set to float64; and L^T L in float32 is often not positive definite."""
+    free: Bool[np.ndarray, "vertices"]
+
+    @staticmethod
+    def of(matrix: sp.spmatrix, free: Bool[np.ndarray, "vertices"]) -> "Matrix":
+        """Take the lower triangle of a sparse matrix."""
+        n = matrix.shape[0]
+        below, diagonal = sp.coo_matrix(sp.tril(matrix, -1)), np.arange(n)
+        entries = np.concatenate([sp.csr_matrix(matrix).diagonal(), below.data]).astype(np.float64)
+        i, j = np.concatenate([diagonal, below.row]), np.concatenate([diagonal, below.col])
+        lower = sp.csc_matrix((entries, (i, j)), shape=(n, n))
+        lower.sort_indices()
+        starts, rows = lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
+        return Matrix(starts, rows, lower.data.view(np.uint32).reshape(-1, 2), np.array(free))
+
+    def key(self) -> UInt32[np.ndarray, "4"]:
+        """Return a hash of the content."""
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(np.array([len(self.free), len(self.rows)], np.int64).data)
+        for part in self:
+            digest.update(np.ascontiguousarray(part).data)
+        return np.frombuffer(digest.digest(), np.uint32)
+
+    def equals(self, other: "Matrix") -> bool:
+        """Whether all entries are the same, bit by bit."""
+        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
+
+    def inner(self) -> sp.csc_matrix:
+        """Return the lower triangle, with the rows and columns of fixed unknowns the identity's.
+
+        So nobody has to pick the free entries of a right-hand side, and the factor is no larger.
+        """
+        n = len(self.free)
+        columns = np.repeat(np.arange(n, dtype=np.int32), np.diff(self.starts))
+        on_diagonal = columns == self.rows
+        free = self.free[columns] & self.free[self.rows]
+        values = np.where(free, self.values.reshape(-1).view(np.float64), 1.0)
+        kept = on_diagonal | free
+        return sp.csc_matrix((values[kept], (self.rows[kept], columns[kept])), shape=(n, n))
+
+
+def cholesky(lower: sp.csc_matrix, dtype: np.dtype, shifts: tuple[float, ...]) -> Any:
+    """Return CHOLMOD's simplicial factor of a matrix, given its lower triangle and diagonal.
+
+    **Raises** NotPositiveDefinite.
+    """
+    lower.sort_indices()
+    kind = CholeskySolverF if dtype == np.float32 else CholeskySolverD
+    starts, rows = lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
+    for shift in shifts:
+        values = lower.data.copy()
+        values[starts[:-1]] *= 1.0 + shift
+        try:
+            return kind(len(starts) - 1, starts, rows, values, MatrixType.CSC)
+        except ValueError:
+            continue
+    raise NotPositiveDefinite(
+        "the system of the free vertices is not positive definite: the mesh spans too many orders "
+        "of magnitude; see jd.inspect(mesh) and jd.repair(mesh)"
+    )
+
+
+class _Factor(NamedTuple):
+    matrix: Matrix
+    solver: Any
+    lock: threading.Lock
+    """CHOLMOD's workspace belongs to the factor."""
+
+    def solve(self, right: np.ndarray, out: np.ndarray) -> None:
+        with self.lock:
+            self.solver.solve(right, out)
+
+
+class _Entry:
+    def __init__(self) -> None:
+        self.factor: Future[_Factor] = Future()
+        self.size = 0
+        self.left_over = False
+
+
+class FactorCache:
+    """Factors by the key of their matrix and their precision, those used last at the end.
+
+    Any number of threads may ask at once: one makes a factor, those that want the same one wait.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        """Set what all factors may take together, in bytes."""
+        self.capacity = capacity
+        self._entries: OrderedDict[tuple[bytes, str], _Entry] = OrderedDict()
+        self._owners: Counter[bytes] = Counter()
+        self._collected: deque[bytes] = deque()
+        self._lock = threading.Lock()
+
+    def get(
+        self,
+        key: UInt32[np.ndarray, "4"],
+        matrix: Matrix,
+        dtype: np.dtype,
+        shifts: tuple[float, ...] = SHIFTS,
+    ) -> _Factor:
+        """Return the factor of a matrix, made where it is missing.
+
+        **Raises** NotPositiveDefinite, and ValueError where key and matrix do not belong together.
+        """
+        name = key.tobytes(), dtype.char
+        with self._lock:
+            entry = self._entries.get(name)
+            missing = entry is None
+            if entry is None:
+                entry = self._entries[name] = _Entry()
+            self._entries.move_to_end(name)
+        if missing:
+            self._make(name, entry, key, matrix, dtype, shifts)
+        factor = entry.factor.result()
+        if not factor.matrix.equals(matrix):
+            raise _mixed_up()
+        return factor
+
+    def own(self, key: UInt32[np.ndarray, "4"], owner: Array) -> None:
+        """Let the factors of this key go some time after the owner is collected."""
+        name = key.tobytes()
+        with self._lock:
+            self._owners[name] += 1
+            for entry in self._of(name):
+                entry.left_over = False
+        # The collector may run anywhere, also in a thread that has the lock: so it only notes.
+        weakref.finalize(owner, self._collected.append, name).atexit = False
+
+    @property
+    def size(self) -> int:
+        """What all factors take together, as estimated."""
+        with self._lock:
+            return sum(entry.size for entry in self._entries.values())
+
+    def clear(self) -> None:
+        """Let go of all factors."""
+        with self._lock:
+            self._entries.clear()
+
+    def _make(self, name, entry: _Entry, key, matrix: Matrix, dtype, shifts) -> None:
+        try:
+            if not np.array_equal(matrix.key(), key):
+                raise _mixed_up()
+            solver = cholesky(matrix.inner(), dtype, shifts)
+            copy = Matrix(*(np.array(x) for x in matrix))
+        except BaseException as error:
+            with self._lock:
+                self._entries.pop(name, None)
+            entry.factor.set_exception(error)
+            raise
+        entries, n = len(copy.rows), len(copy.free)
+        with self._lock:
+            entry.size = int(entries * (_FACTOR_BYTES * np.log2(n + 1) + _MATRIX_BYTES))
+            if name in self._entries:
+                self._free_some(name)
+        entry.factor.set_result(_Factor(copy, solver, threading.Lock()))
+
+    def _of(self, key: bytes) -> list[_Entry]:
+        return [self._entries[key, c] for c in "fd" if (key, c) in self._entries]
+
+    def _free_some(self, made) -> None:
+        while self._collected:
+            key = self._collected.popleft()
+            self._owners[key] -= 1
+            if not self._owners[key]:
+                del self._owners[key]
+                for entry in self._of(key):
+                    entry.left_over = True
+        rest = [x for x, entry in self._entries.items() if x != made and entry.factor.done()]
+        left_over = [x for x in rest if self._entries[x].left_over]
+        self._shrink(left_over, _LEFT_OVER, least=2)
+        rest = sorted((x for x in rest if x in self._entries), key=lambda x: x not in left_over)
+        self._shrink(rest, self.capacity - self._entries[made].size, least=0)
+
+    def _shrink(self, names: list, limit: int, least: int) -> None:
+        total = sum(self._entries[x].size for x in names)
+        for name in names[: len(names) - least]:
+            if total <= limit:
+                break
+            total -= self._entries.pop(name).size
+
+
+def _mixed_up() -> ValueError:
+    return ValueError(
+        "the arrays of this factor do not belong together: some were changed or come from another "
+        "problem. Make the problem anew with precompute"
+    )
+
+
+factors = FactorCache(CAPACITY)
+# nanobind would call them leaked. Programs have ended then: host_call.py, imported later, is asked
+# earlier.
+atexit.register(factors.clear)

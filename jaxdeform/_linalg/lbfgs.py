@@ -1,0 +1,316 @@
+"""Preconditioned L-BFGS for one minimisation or a queue of them.
+
+This is the engine behind :class:`QuasiNewton`. All it knows about meshes is that positions are
+(3, vertices) and that A^-1 serves as the preconditioner.
+
+Under vmap, the general rule for loops would run every member of the batch until the slowest is
+done, and select between old and new values of everything in every iteration. For 64 bars, of which
+the slowest takes twice the mean, each bar then takes 6 times as long as one bar alone. Here the
+batch is a queue instead: a few slots iterate together, and a slot whose member is done takes the
+next one.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxdeform._linalg.cholesky import has_accelerator
+from jaxdeform._linalg.xla import after_reads, without_fusion
+
+# How many members of the batch iterate together. More slots wait longer for each other at the end
+# and outgrow the caches; fewer leave cores idle. Each of 64 bars takes 10.5, 10.3, 11.2, 13.7 and
+# 16.1 ms with 8, 12, 16, 24 and 32 slots. Tried: going down to 4 slots once the queue is empty. It
+# would save a tenth of the time but take twice as long to compile.
+SLOTS = 12
+
+# On an accelerator, use as many slots as have this many vertices in total, enough to fill it. Their
+# arrays then take about 4 GB in float64. (Estimated, not measured: no accelerator was available.)
+VERTICES_AT_ONCE = 1 << 22
+
+
+class Settings(NamedTuple):
+    """When to stop, and how many steps to remember; see :class:`QuasiNewton`."""
+
+    tolerance: float
+    max_steps: int
+    history_length: int
+
+
+class Sample(NamedTuple):
+    """The result of an evaluation at p, for one p or for a batch (the last axis)."""
+
+    transforms: Float[Array, "3 3 vertices *batch"]
+    gradient: Float[Array, "3 vertices *batch"]
+    """Half the gradient of the reduced energy, A p - K^T T; 0 at fixed vertices."""
+    energy: Float[Array, "*batch"]
+    rounding: Float[Array, "*batch"]
+    """Two energies that differ by less than this differ only by rounding."""
+
+
+class Minimum(NamedTuple):
+    """Where a minimisation ended."""
+
+    p: Float[Array, "3 vertices"]
+    transforms: Float[Array, "3 3 vertices"]
+    energy: Float[Array, "history"]
+    """At the start and after each step; undefined beyond the last step."""
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."]:
+    """Return whether a plain step would gain less than the tolerance, or less than rounding hides.
+
+    The gain <g, A^-1 g> is a square, so it is known far more exactly than the energy itself.
+    """
+    eps = jnp.finfo(energy.dtype).eps
+    return gain <= tolerance * jnp.abs(energy) + 1e3 * eps * rounding
+
+
+def minimize(
+    evaluate: Callable[[Any, Any, Array], Sample],
+    system: Any,
+    inputs: Any,
+    start: Float[Array, "3 vertices"],
+    settings: Settings,
+) -> Minimum:
+    """Minimise from a start. Under vmap over ``inputs`` and ``start``, run the batch as a queue.
+
+    ``evaluate(system, inputs, p)`` evaluates a batch, which is the last axis of ``inputs``, ``p``
+    and the result. ``system.factor.solve`` applies A^-1.
+    """
+
+    @custom_vmap
+    def batch(system, inputs, start):
+        return _run_queue(evaluate, system, inputs, start, settings)
+
+    @batch.def_vmap
+    def larger_batch(size, is_batched, system, *own):
+        if any(jax.tree.leaves(is_batched[0])):
+            raise NotImplementedError("vmap over problems: they differ in structure; use a loop")
+        spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
+        own = jax.tree.map(spread, own, tuple(is_batched[1:]))
+        each = own[-1].shape[1]
+        flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
+        out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), batch(system, *flat))
+        return out, jax.tree.map(lambda _: True, out)
+
+    one = jax.tree.map(lambda x: x[None], (inputs, start))
+    return jax.tree.map(lambda x: x[0], batch(system, *one))
+
+
+class _Memory(NamedTuple):
+    """The last steps s of each slot, and z = A^-1 y, where y is the change of the gradient.
+
+    The large arrays are ring buffers. The inner products that the two-loop recursion needs are kept
+    in order of age, oldest first, so that a direction costs two passes over each large array.
+    """
+
+    s: Float[Array, "slots steps 3 vertices"]
+    z: Float[Array, "slots steps 3 vertices"]
+    filled: Bool[Array, "slots steps"]
+    sy: Float[Array, "slots steps steps"]
+    """s_i . y_j if step i is not newer than step j, else 0."""
+    yzy: Float[Array, "slots steps steps"]
+    """y_i . z_j."""
+    sg: Float[Array, "slots steps"]
+    """s_i . g, with the gradient g at the position of the slot."""
+    zg: Float[Array, "slots steps"]
+    """z_i . g."""
+
+
+class _Slots(NamedTuple):
+    """The members at work: the accepted position of each, and the evaluation there.
+
+    The slots are the first axis, because products with the memory go slot by slot. In ``at`` they
+    are the last axis, because an evaluation goes vertex by vertex (ell.py).
+    """
+
+    p: Float[Array, "slots 3 vertices"]
+    at: Sample
+    z: Float[Array, "slots 3 vertices"]
+    """A^-1 gradient: minus the plain step."""
+    gain: Float[Array, "slots"]
+    """<gradient, z>: twice the expected gain of a plain step."""
+    iteration: Int[Array, "slots"]
+    """Number of evaluations so far."""
+    history: Float[Array, "slots history"]
+    memory: _Memory
+    stalled: Bool[Array, "slots"]
+    """True where two steps in a row were refused."""
+
+
+def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
+    count = start.shape[0]
+    most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
+    slots = min(count, most)
+    out = Minimum(
+        jnp.zeros_like(start),
+        jnp.zeros((count, 3, *start.shape[1:]), start.dtype),
+        jnp.zeros((count, settings.max_steps + 1), start.dtype),
+        jnp.zeros(count, jnp.int32),
+        jnp.zeros(count, bool),
+    )
+    if not count:
+        return out
+    work = _empty(start[:slots], settings)
+    work = _restart(work, jnp.ones(slots, bool), work.p)
+    member = jnp.arange(slots, dtype=jnp.int32)
+
+    def finish_some(state):
+        """Iterate until a member is done; store its result and start the next one."""
+        tick, member, following, work, out = state
+        own = jax.tree.map(lambda x: jnp.moveaxis(x.at[member].get(mode="clip"), 0, -1), inputs)
+        advance = partial(_advance, evaluate, system, own, settings)
+        idle = member >= count
+        tick, work = jax.lax.while_loop(
+            lambda s: ~jnp.any(_done(s[1], settings) & ~idle), lambda s: advance(*s), (tick, work)
+        )
+        done = _done(work, settings) & ~idle
+        ended = work.stalled | _converged(work, settings)
+        transforms = jnp.moveaxis(work.at.transforms, -1, 0)
+        found = Minimum(work.p, transforms, work.history, work.iteration - 1, ended)
+        place = jnp.where(done, member, count)
+        out = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), out, found)
+        member = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, member)
+        # A slot without a next member stays at its solution, where a step costs the least.
+        work = _restart(work, done & (member < count), start.at[member].get(mode="clip"))
+        return tick, member, following + jnp.sum(done, dtype=jnp.int32), work, out
+
+    begin = (jnp.zeros((), jnp.int32), member, jnp.asarray(slots, jnp.int32), work, out)
+    return jax.lax.while_loop(lambda s: jnp.any(s[1] < count), finish_some, begin)[-1]
+
+
+def _empty(p: Float[Array, "slots 3 vertices"], settings: Settings) -> _Slots:
+    w, m, dtype = p.shape[0], settings.history_length, p.dtype
+    zeros = lambda *shape: jnp.zeros((w, *shape), dtype)  # noqa: E731
+    shape, small = p.shape[1:], (m, m)
+    at = Sample(*(jnp.zeros((*axes, w), dtype) for axes in ((3, *shape), shape, (), ())))
+    filled = jnp.zeros((w, m), bool)
+    memory = _Memory(
+        zeros(m, *shape), zeros(m, *shape), filled, zeros(*small), zeros(*small), zeros(m), zeros(m)
+    )
+    iteration, history = jnp.zeros(w, jnp.int32), zeros(settings.max_steps + 1)
+    return _Slots(p, at, zeros(*shape), zeros(), iteration, history, memory, jnp.zeros(w, bool))
+
+
+def _restart(
+    work: _Slots, which: Bool[Array, "slots"], p: Float[Array, "slots 3 vertices"]
+) -> _Slots:
+    """Reset some slots to the state before their first evaluation: zero step, infinite energy."""
+    wide = which[:, None, None]
+    return work._replace(
+        p=jnp.where(wide, p, work.p),
+        z=jnp.where(wide, 0.0, work.z),
+        at=work.at._replace(energy=jnp.where(which, jnp.inf, work.at.energy)),
+        iteration=jnp.where(which, 0, work.iteration),
+        memory=work.memory._replace(filled=work.memory.filled & ~which[:, None]),
+        stalled=work.stalled & ~which,
+    )
+
+
+def _converged(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
+    return has_converged(work.gain, work.at.energy, work.at.rounding, settings.tolerance)
+
+
+def _done(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
+    running = (work.iteration <= settings.max_steps) & ~work.stalled & ~_converged(work, settings)
+    return (work.iteration > 0) & ~(running & jnp.isfinite(work.at.energy))
+
+
+def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
+    step = _direction(work.memory, work.z, tick)
+    # The first iteration evaluates the start: its step is zero and its old energy infinite. (The
+    # local step is thus compiled only once.) A member that is done waits.
+    step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
+    p = work.p + step
+    new = without_fusion(
+        tick >= 0, work.at, partial(evaluate, system), inputs, jnp.moveaxis(p, 0, -1)
+    )
+    right = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 0)
+    g = right[:, 1]
+    z = system.factor.solve(g)
+    dz = z - work.z
+    # All inner products of the iteration except those with the memory, as one batched product.
+    left = jnp.stack([step, dz, z], axis=1)
+    products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
+    first = work.iteration == 0
+    plain = ~jnp.any(work.memory.filled, axis=1)
+    # Where even a plain step ends in NaN there is no way on: it is kept, which ends the member.
+    lost = plain & jnp.isnan(new.energy)
+    good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
+    # A refused step costs its evaluation and clears the memory. The plain step that follows cannot
+    # raise the energy, so a second refusal in a row is due to rounding.
+    stalled = work.stalled | (~good & plain)
+    memory = _remember(work.memory, tick, good & ~first, good, step, dz, g, products)
+    keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
+    at = jax.tree.map(keep, new, work.at)
+    slot = jnp.arange(p.shape[0], dtype=jnp.int32)
+    history = work.history.at[slot, work.iteration].set(at.energy, mode="drop")
+    wide = good[:, None, None]
+    p, z = jnp.where(wide, p, work.p), jnp.where(wide, z, work.z)
+    gain = keep(products[:, 2, 1], work.gain)
+    return tick + 1, _Slots(p, at, z, gain, work.iteration + 1, history, memory, stalled)
+
+
+def _direction(memory: _Memory, z, tick) -> Float[Array, "slots 3 vertices"]:
+    """Return the L-BFGS step by the two-loop recursion, on the coefficients of s and z.
+
+    The loops, from the newest step to the oldest and back, are two triangular systems with the
+    matrix s_i . y_j. Nocedal, "Updating quasi-Newton matrices with limited storage" (1980),
+    doi:10.1090/S0025-5718-1980-0572855-7.
+    """
+    m = memory.filled.shape[1]
+    both = memory.filled[:, :, None] & memory.filled[:, None]
+    upper = jnp.where(both, memory.sy, jnp.eye(m, dtype=z.dtype))
+    diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
+    solve = jax.lax.linalg.triangular_solve
+    alpha = jnp.where(memory.filled, memory.sg, 0.0)[..., None]
+    alpha = solve(upper, alpha, left_side=True)
+    bent = jnp.sum(jnp.where(both, memory.yzy, 0.0) * jnp.swapaxes(alpha, 1, 2), axis=2)
+    gamma = diagonal * alpha[..., 0] + bent - memory.zg
+    gamma = jnp.where(memory.filled, gamma, 0.0)[..., None]
+    gamma = solve(upper, gamma, left_side=True, transpose_a=True)
+    # Go from the order of age to that of the ring buffer, where the oldest entry is filled next.
+    place = (jnp.arange(m, dtype=tick.dtype) - tick) % m
+    alpha, gamma = alpha[:, place, 0], gamma[:, place, 0]
+    back = jnp.einsum("wm,wmak->wak", alpha, memory.z, precision="highest")
+    return back - jnp.einsum("wm,wmak->wak", gamma, memory.s, precision="highest") - z
+
+
+def _remember(memory: _Memory, tick, new, good, step, dz, g, products) -> _Memory:
+    """Overwrite the oldest step with the new one if the curvature along it is positive.
+
+    A slot whose step was refused forgets all steps.
+    """
+    m = memory.filled.shape[1]
+    age = (jnp.arange(m, dtype=tick.dtype) + tick) % m
+    sy, yzy = products[:, 0, 0], products[:, 1, 0]
+    sg = jnp.einsum("wmak,wak->wm", memory.s, g, precision="highest")[:, age]
+    zg = jnp.einsum("wmak,wak->wm", memory.z, g, precision="highest")[:, age]
+    # NaN fails the comparison, so nothing that is not finite enters the memory.
+    kept = after_reads(new & (sy > 1e-10 * yzy), yzy + jnp.sum(sg + zg, axis=1))
+    column, square = sg - memory.sg, zg - memory.zg
+
+    def later(matrix, row, column, corner):
+        """Drop the oldest row and column, and append the newest."""
+        top = jnp.concatenate([matrix[:, 1:, 1:], column[:, 1:, None]], axis=2)
+        bottom = jnp.concatenate([row[:, 1:], corner[:, None]], axis=1)
+        return jnp.concatenate([top, bottom[:, None]], axis=1)
+
+    append = lambda x, last: jnp.concatenate([x[:, 1:], last[:, None]], axis=1)  # noqa: E731
+    slot, where = tick % m, kept[:, None, None]
+    return _Memory(
+        s=memory.s.at[:, slot].set(jnp.where(where, step, memory.s[:, slot])),
+        z=memory.z.at[:, slot].set(jnp.where(where, dz, memory.z[:, slot])),
+        filled=append(memory.filled & good[:, None], kept),
+        sy=later(memory.sy, jnp.zeros_like(column), column, sy),
+        yzy=later(memory.yzy, square, square, yzy),
+        sg=append(sg, products[:, 0, 1]),
+        zg=append(zg, products[:, 1, 1]),
+    )

@@ -1,0 +1,225 @@
+"""Cells: the edges that deform together with a vertex (thesis Sec. 2.3)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.laplacian import cotangent_weights
+from jaxdeform._mesh.mesh import Mesh, content_digest
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """One cell per vertex: the edges that the transformation of this vertex has to fit.
+
+    Made by :func:`rings` and :func:`spokes`. Like the mesh, cells are a value: equal content makes
+    them equal, in every process.
+    """
+
+    mesh: Mesh
+    """The rest shape that the cells belong to."""
+    weights: Float[np.ndarray, "edges"]
+    """One weight per row of ``mesh.edges``; cotangent weights by default."""
+    membership: sp.csr_matrix
+    """(vertices, edges): 1 where the edge belongs to the cell of the vertex."""
+
+    @property
+    def edges(self) -> Int[np.ndarray, "edges 2"]:
+        """Undirected edges (i < j) of the mesh, each once."""
+        return self.mesh.edges
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, which is also the number of cells."""
+        return self.mesh.n_vertices
+
+    @cached_property
+    def digest(self) -> bytes:
+        """A fingerprint of the content: the same for equal cells, in every process."""
+        member = self.membership
+        mesh = np.frombuffer(self.mesh.digest, np.uint8)
+        return content_digest(mesh, self.weights, member.indptr, member.indices, member.data)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other cells have the same mesh, weights and membership."""
+        return self is other or (isinstance(other, Cells) and self.digest == other.digest)
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash(self.digest)
+
+    @property
+    def overlap(self) -> Int[np.ndarray, "edges"]:
+        """The number of cells that contain each edge: d_e of Eq. 4.5."""
+        return np.bincount(self.membership.indices, minlength=len(self.edges))
+
+    @property
+    def reach(self) -> sp.csr_matrix:
+        """(cells, vertices): nonzero at the ends of the edges of a cell and at its centre."""
+        count, n = len(self.edges), self.n_vertices
+        rows = np.repeat(np.arange(count), 2)
+        ends = sp.csr_matrix((np.ones(2 * count, np.int32), (rows, self.edges.ravel())), (count, n))
+        inside = self.membership.astype(np.int32) @ ends
+        return sp.csr_matrix(inside + sp.eye_array(n).astype(np.int32))
+
+    def __repr__(self) -> str:
+        """Return the sizes, not the arrays."""
+        mean = self.membership.nnz / max(self.n_vertices, 1)
+        return f"Cells({self.n_vertices} cells, {len(self.edges)} edges, {mean:.1f} edges per cell)"
+
+
+def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> Cells:
+    """Return the r-ring cells: ``E(k, r)`` holds the edges with both ends within r steps of k.
+
+    A cell with ``r = 1`` includes the edges of its rim, so it is not the neighbourhood of ARAP; see
+    :func:`spokes` for that. Thesis Sec. 2.3, after Chen, Gao, Lai and Xia, "Rigidity controllable
+    as-rigid-as-possible shape deformation" (2017).
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - r: an integer >= 1, or one per vertex, (vertices,).
+    - weights: (edges,), one finite weight per row of ``mesh.edges``, used as given. By default,
+      cotangent weights. Negative ones (obtuse angles) are kept, except where they make the moments
+      ``B_k = sum w e e^T`` of a cell indefinite: there they are set to 0, because stretching such a
+      cell would lower its energy. Few meshes have such cells.
+
+    **Returns** :class:`Cells`.
+
+    **Raises** InputError: r is below 1, not an integer, or of the wrong length; the weights are not
+    finite or of the wrong length.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.rings(jd.shapes.bar(), 2)
+        Cells(722 cells, 2160 edges, 41.8 edges per cell)
+    """
+    n = mesh.n_vertices
+    radius = np.asarray(r)
+    if radius.dtype.kind not in "iu":
+        raise InputError(f"r must be an integer, or one per vertex, got {radius.dtype}: try 1")
+    if radius.ndim > 0 and radius.shape != (n,):
+        raise InputError(
+            f"r has shape {radius.shape}, but the mesh has {n} vertices: give one integer or ({n},)"
+        )
+    radius = np.broadcast_to(radius, (n,))
+    if radius.min() < 1:
+        k = int(radius.argmin())
+        raise InputError(
+            f"r = {radius[k]} at vertex {k}: give 1 or more, or use spokes(mesh) for ARAP"
+        )
+
+    incidence = _incidence(mesh)
+    # Booleans, because counts of paths would overflow: in eight bits, 256 paths count as 0.
+    ends_at = incidence.astype(bool)
+    step = sp.csr_matrix(ends_at @ ends_at.T + sp.eye_array(n).astype(bool))
+    reach = step
+    for ring in range(2, int(radius.max()) + 1):
+        growing = sp.csr_matrix(sp.diags_array(radius >= ring, dtype=bool) @ reach)
+        growing.eliminate_zeros()
+        wider = sp.csr_matrix(reach + growing @ step)
+        if wider.nnz == reach.nnz:
+            break  # every cell already covers its connected component
+        reach = wider
+    # A cell reaches none, one or both ends of an edge. The edge is a member if it reaches both.
+    ends = sp.csr_matrix(reach.astype(np.int8) @ incidence)
+    ends.data = (ends.data == 2).astype(np.int8)
+    ends.eliminate_zeros()
+    ends.sort_indices()
+    chosen = _weights(mesh, weights)
+    if weights is None:
+        chosen = _bounded(mesh, ends, chosen)
+    return Cells(mesh, chosen, ends)
+
+
+def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
+    """Return the cells of plain ARAP: the edges that meet at the vertex (Eq. 3.3).
+
+    Sorkine and Alexa, "As-rigid-as-possible surface modeling" (2007),
+    doi:10.2312/SGP/SGP07/109-116.
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - weights: (edges,), as in :func:`rings`, but negative cotangent weights are always kept, as in
+      other ARAP programs: rotations do not need B. For a material on an obtuse mesh, use rings, or
+      pass weights that are not negative.
+
+    **Returns** :class:`Cells`.
+
+    **Raises** InputError: the weights are not finite or of the wrong length.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.spokes(jd.shapes.bar())
+        Cells(722 cells, 2160 edges, 6.0 edges per cell)
+    """
+    return Cells(mesh, _weights(mesh, weights), _incidence(mesh))
+
+
+def principal_moments(
+    cells: Cells,
+) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3 3"]]:
+    """Return the principal moments b (ascending) and axes Q of each cell.
+
+    ``B_k = sum_e w_e e e^T = Q_k diag(b_k) Q_k^T``, in units of length squared. The columns of Q_k
+    are the principal axes of cell k; Q_k is a proper rotation.
+    """
+    i, j = cells.edges.T
+    edge = cells.mesh.vertices[i] - cells.mesh.vertices[j]
+    outer = cells.weights[:, None, None] * edge[:, :, None] * edge[:, None, :]
+    moments = (cells.membership.astype(np.float64) @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
+    values, axes = np.linalg.eigh(moments)
+    # If Q were a reflection, the proper rotation of a cell would become an improper one.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return values, axes
+
+
+def indefinite_cells(cells: Cells) -> Int[np.ndarray, "bad"]:
+    """Return the cells with a clearly negative moment."""
+    moments, _ = principal_moments(cells)
+    return np.flatnonzero(moments[:, 0] < -1e-9 * np.abs(moments).max(axis=1))
+
+
+def _bounded(
+    mesh: Mesh, membership: sp.csr_matrix, weights: Float[np.ndarray, "edges"]
+) -> Float[np.ndarray, "edges"]:
+    """Set negative weights in indefinite cells to 0. Raising a weight harms no other cell."""
+    if (weights >= 0).all():
+        return weights
+    bad = indefinite_cells(Cells(mesh, weights, membership))
+    touched = np.unique(membership[bad].indices)
+    out = weights.copy()
+    out[touched] = np.maximum(out[touched], 0.0)
+    return out
+
+
+def _incidence(mesh: Mesh) -> sp.csr_matrix:
+    """Return (vertices, edges): 1 where the vertex is an end of the edge."""
+    count = len(mesh.edges)
+    columns = np.repeat(np.arange(count, dtype=np.int32), 2)
+    matrix = sp.csr_matrix(
+        (np.ones(2 * count, np.int8), (mesh.edges.ravel(), columns)),
+        shape=(mesh.n_vertices, count),
+    )
+    matrix.sort_indices()
+    return matrix
+
+
+def _weights(mesh: Mesh, weights: ArrayLike | None) -> Float[np.ndarray, "edges"]:
+    if weights is None:
+        return cotangent_weights(mesh)
+    given = np.asarray(weights, dtype=np.float64)
+    if given.shape != (len(mesh.edges),):
+        raise InputError(
+            f"weights have shape {given.shape}: give one per row of mesh.edges, "
+            f"({len(mesh.edges)},)"
+        )
+    if not np.isfinite(given).all():
+        bad = int(np.flatnonzero(~np.isfinite(given))[0])
+        raise InputError(f"the weight of edge {bad} is {given[bad]}: weights must be finite")
+    return given

@@ -1,0 +1,86 @@
+"""Cotangent weights and the weighted graph Laplacian (thesis Sec. 2.4).
+
+An edge has a negative cotangent weight if its opposite angles sum to more than 180 degrees. This is
+the policy for such weights:
+
+- They are kept, so that A is the exact Dirichlet energy and the engine agrees with other ARAP
+  programs.
+- ``rings`` sets them to 0 in the few cells whose moments they make indefinite (cells.py).
+- Where A is still indefinite, ``precompute`` replaces all weights by :func:`lifted_weights`, with a
+  warning. The smoothness prior of estimation always uses lifted weights: with a negative weight it
+  would reward a difference across the edge.
+- :func:`normalised_laplacian` keeps its divisors away from 0.
+"""
+
+import igl
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+
+from jaxdeform._mesh.mesh import Mesh
+
+
+def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
+    """Return one weight per row of ``mesh.edges``: ``w_ij = (cot a + cot b) / 2``.
+
+    The angles a and b are opposite to the edge (thesis Sec. 2.4; Pinkall and Polthier, "Computing
+    discrete minimal surfaces and their conjugates", 1993, doi:10.1080/10586458.1993.10504266). A
+    border edge has one such angle, an edge with three faces has three. Weights have no unit: they
+    do not change when the mesh is scaled.
+
+    A weight is negative where the angles sum to more than 180 degrees. Such weights are kept: if
+    all edges have the same overlap, the stiffness matrix is then the exact Dirichlet energy, which
+    is never negative, and the engine agrees with other ARAP programs. Where cells of mixed size
+    make the matrix indefinite, :func:`precompute` lifts the negative weights to a small positive
+    one and warns. To have none from the start, pass ``np.maximum(w, 1e-6)`` to :func:`rings` or
+    :func:`spokes`.
+
+    **Arguments**: mesh.
+
+    **Returns** (edges,) floats, in the order of ``mesh.edges``.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.cotangent_weights(jd.shapes.bar()).shape
+        (2160,)
+    """
+    # Scale first, because libigl squares areas: a mesh 1e-90 wide would underflow.
+    vertices = mesh.vertices - mesh.vertices.mean(axis=0)
+    vertices = vertices / np.abs(vertices).max()
+    matrix = igl.cotmatrix(vertices, mesh.faces).tocsr()
+    i, j = mesh.edges.T
+    return np.asarray(matrix[i, j]).ravel()
+
+
+def lifted_weights(weights: Float[np.ndarray, "edges"]) -> Float[np.ndarray, "edges"]:
+    """Return the weights, each at least 1e-3 of their mean absolute value."""
+    return np.maximum(weights, 1e-3 * np.abs(weights).mean())
+
+
+def difference_matrix(edges: Int[np.ndarray, "edges 2"], n_vertices: int) -> sp.csr_matrix:
+    """Return D, (edges, vertices), with ``(D p)_e = p_i - p_j`` for the edge e = (i, j)."""
+    count = len(edges)
+    rows = np.repeat(np.arange(count), 2)
+    signs = np.tile([1.0, -1.0], count)
+    return sp.csr_matrix((signs, (rows, edges.ravel())), shape=(count, n_vertices))
+
+
+def graph_laplacian(
+    edges: Int[np.ndarray, "edges 2"], weights: Float[np.ndarray, "edges"], n_vertices: int
+) -> sp.csr_matrix:
+    """Return ``D^T diag(w) D``. It is positive semidefinite if no weight is negative."""
+    difference = difference_matrix(edges, n_vertices)
+    return (difference.T @ sp.diags(weights) @ difference).tocsr()
+
+
+def normalised_laplacian(
+    edges: Int[np.ndarray, "edges 2"], weights: Float[np.ndarray, "edges"], n_vertices: int
+) -> sp.csr_matrix:
+    """Return L of Eq. 3.1: each row of the Laplacian divided by the sum of weights at its vertex.
+
+    Where negative weights bring that sum near 0, 1e-2 of the sum of absolute weights is used.
+    """
+    laplacian = graph_laplacian(edges, weights, n_vertices)
+    size = sum(np.bincount(end, np.abs(weights), n_vertices) for end in edges.T)
+    total = np.maximum(laplacian.diagonal(), 1e-2 * size)
+    return sp.csr_matrix(sp.diags(1.0 / np.where(total > 0, total, 1.0)) @ laplacian)

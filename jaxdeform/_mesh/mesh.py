@@ -1,0 +1,199 @@
+"""Triangle meshes: checked once, then frozen (thesis chapter 2)."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float, Int
+
+from jaxdeform._errors import ArrayLike, InputError
+
+# A triangle has no area if its height is below this fraction of its longest edge: float64 cannot
+# tell such an area from rounding, and the cotangents would be noise. Thin but real triangles
+# (0.4 degrees) lie a factor of 1e10 above it.
+_FLAT = 1e-13
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Mesh:
+    """A triangle mesh, checked once when it is made, then frozen.
+
+    Open borders, several connected components, unreferenced vertices, non-manifold edges and
+    vertices, and inward-facing faces are all allowed; :func:`inspect` reports them.
+
+    A mesh is a value. Two meshes with the same numbers are equal and have the same hash, even after
+    pickling or in another process. The arrays are read-only: copy one before you change it.
+
+    **Arguments**
+
+    - vertices: (vertices, 3), in any unit of length.
+    - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
+
+    **Raises** InputError: an array is empty or has the wrong shape; a vertex is not finite; a face
+    index is out of range; a face repeats a vertex or has no area (:func:`repair` drops those).
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        Mesh(3 vertices, 1 faces)
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    """Positions, in any unit of length."""
+    faces: Int[np.ndarray, "faces 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
+
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+        """Copy, check and freeze the arrays."""
+        vertices, faces = checked_arrays(vertices, faces)
+        for reason, face in degenerate_faces(vertices, faces):
+            raise InputError(
+                f"face {face} {faces[face].tolist()} {reason}: drop such faces with "
+                "jd.repair((vertices, faces))"
+            )
+        for name, array in (("vertices", vertices), ("faces", faces)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.vertices)
+
+    @property
+    def n_faces(self) -> int:
+        """Number of faces."""
+        return len(self.faces)
+
+    @cached_property
+    def edges(self) -> Int[np.ndarray, "edges 2"]:
+        """Undirected edges (i < j), each once, in ascending order."""
+        return unique_edges(self.faces)
+
+    @cached_property
+    def referenced(self) -> Bool[np.ndarray, "vertices"]:
+        """True for each vertex that belongs to a face."""
+        mask = np.zeros(self.n_vertices, bool)
+        mask[self.faces.ravel()] = True
+        return mask
+
+    @cached_property
+    def components(self) -> Int[np.ndarray, "vertices"]:
+        """Connected component of each vertex, numbered from 0."""
+        return connected_components(self.edges, self.n_vertices)
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the bounding box of the vertices that belong to a face."""
+        return float(np.linalg.norm(np.ptp(self.vertices[self.referenced], axis=0)))
+
+    @cached_property
+    def digest(self) -> bytes:
+        """A fingerprint of the content: the same for equal meshes, in every process."""
+        return content_digest(self.vertices, self.faces)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other mesh has the same numbers."""
+        return self is other or (isinstance(other, Mesh) and self.digest == other.digest)
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash(self.digest)
+
+    def __reduce__(self):
+        """Pickle the two arrays; loading checks and freezes them again."""
+        return Mesh, (self.vertices, self.faces)
+
+    def __repr__(self) -> str:
+        """Return the sizes, not the arrays."""
+        return f"Mesh({self.n_vertices} vertices, {self.n_faces} faces)"
+
+
+def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies of valid shape, with finite vertices and indices in range, or raise."""
+    try:
+        points = np.array(vertices, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"vertices cannot be read as numbers: {error}") from error
+    try:
+        corners = np.array(faces, order="C")
+    except ValueError as error:
+        raise InputError(
+            f"faces cannot be read as an array of indices: {error}: give (faces, 3)"
+        ) from error
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise InputError(
+            f"vertices have shape {points.shape}: give (vertices, 3), at least one vertex"
+        )
+    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
+        raise InputError(
+            f"faces have shape {corners.shape}: give (faces, 3) triangles, at least one"
+        )
+    if corners.dtype.kind not in "iu":
+        raise InputError(f"faces must be integers, got {corners.dtype}: give vertex indices")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} in total): give finite "
+            "positions"
+        )
+    corners = corners.astype(np.int64)
+    bad = np.flatnonzero(((corners < 0) | (corners >= len(points))).any(axis=1))
+    if bad.size:
+        raise InputError(
+            f"face {bad[0]} {corners[bad[0]].tolist()} names a vertex out of range: vertices "
+            f"are 0 to {len(points) - 1}"
+        )
+    return points, corners
+
+
+def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, int]]:
+    """Return (reason, face) for each face that repeats a vertex or has no area."""
+    repeats = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    found = [("repeats a vertex", int(k)) for k in np.flatnonzero(repeats)]
+    # Scale the mesh as a whole, then each face, so that no number leaves the range of float64.
+    corner = (points / (np.abs(points).max() or 1.0))[faces]
+    u, v, w = (corner[:, i] - corner[:, j] for i, j in ((1, 0), (2, 0), (2, 1)))
+    longest = np.abs(np.concatenate([u, v, w], axis=1)).max(axis=1)
+    size = np.where(longest > 0, longest, 1.0)[:, None]
+    area = np.linalg.norm(np.cross(u / size, v / size), axis=1)
+    flat = (area <= _FLAT) & ~repeats
+    return found + [("has no area", int(k)) for k in np.flatnonzero(flat)]
+
+
+def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    # Encode each pair as one number, because np.unique over rows is ten times slower.
+    n = int(faces.max()) + 1
+    code = np.unique(pairs[:, 0] * n + pairs[:, 1])
+    return np.stack([code // n, code % n], axis=1)
+
+
+def connected_components(
+    edges: Int[np.ndarray, "edges 2"], n_vertices: int
+) -> Int[np.ndarray, "vertices"]:
+    """Return the connected component of each vertex, numbered from 0."""
+    links = (np.ones(len(edges), np.int8), tuple(edges.T))
+    graph = sp.coo_matrix(links, shape=(n_vertices, n_vertices))
+    return sp.csgraph.connected_components(graph, directed=False)[1]
+
+
+def content_digest(*arrays: np.ndarray) -> bytes:
+    """Return a 128-bit fingerprint of the shapes, dtypes and numbers of some arrays."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(f"{array.shape} {array.dtype.str}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()
+
+
+def merge_equal_points(points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct points in order of appearance, and the new index of each old point."""
+    points = points + 0.0  # turns -0.0 into 0.0
+    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return points[first[order]], rank[inverse.ravel()]

@@ -1,0 +1,127 @@
+"""Deform a piece of a mesh: cut it out, deform it, put it back (thesis Sec. 4.1.4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.cells import Cells, rings
+from jaxdeform._mesh.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Submesh:
+    """A piece of a mesh around the free vertices; made by :func:`submesh`."""
+
+    mesh: Mesh
+    """The piece, as a mesh of its own."""
+    cells: Cells
+    """The cells of the whole mesh that contain a free vertex; the other cells are empty."""
+    handles: Int[np.ndarray, "handles"]
+    """The vertices of the piece that are not free, by their index in the piece."""
+    index: Int[np.ndarray, "piece"]
+    """The index in the whole mesh of each vertex of the piece."""
+    whole: Mesh
+    """The mesh that the piece was cut from."""
+
+    def reinsert(
+        self, vertices: ArrayLike, base: ArrayLike | None = None
+    ) -> Float[np.ndarray, "vertices 3"]:
+        """Return the positions of the whole mesh, with the piece put back.
+
+        **Arguments**
+
+        - vertices: (piece, 3), the deformed piece.
+        - base: (vertices, 3), positions for all other vertices; by default their rest positions.
+
+        **Returns** (vertices, 3).
+
+        **Raises** InputError: a shape is wrong.
+        """
+        piece = np.asarray(vertices)
+        if piece.shape != (len(self.index), 3):
+            raise InputError(f"vertices have shape {piece.shape}: give ({len(self.index)}, 3)")
+        rest = self.whole.vertices if base is None else np.asarray(base)
+        if rest.shape != self.whole.vertices.shape:
+            raise InputError(f"base has shape {rest.shape}: give {self.whole.vertices.shape}")
+        out = np.array(rest, dtype=np.float64)
+        out[self.index] = piece
+        return out
+
+
+def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
+    """Cut out the cells that contain a free vertex, and nothing else.
+
+    A cell whose vertices are all fixed has a fixed transformation, so it can be left out: the piece
+    deforms exactly as it would within the whole mesh (up to rounding).
+
+    **Arguments**
+
+    - mesh: the whole mesh.
+    - free: indices of the vertices that may move, or a mask (vertices,).
+    - cells: the cells of the whole mesh; by default ``rings(mesh, 1)``.
+
+    **Returns** a :class:`Submesh`.
+
+    **Raises** InputError: no vertex is free; an index is out of range; the cells are of another
+    mesh.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> piece = jd.submesh(mesh, mesh.vertices[:, 1] > 120)
+        >>> problem = jd.precompute(piece.mesh, piece.handles, cells=piece.cells)
+        >>> out = jd.deform(problem, piece.mesh.vertices[piece.handles], 1.0)
+        >>> piece.reinsert(out.vertices).shape
+        (722, 3)
+    """
+    cells = rings(mesh, 1) if cells is None else cells
+    if cells.mesh != mesh:
+        raise InputError("cells are of another mesh: call rings(mesh, r) for this one")
+    is_free = _mask(free, mesh.n_vertices)
+    # The vertices of each cell, including its centre.
+    reach = cells.reach
+    moving = np.asarray((reach @ is_free.astype(np.int32)) > 0).ravel()
+    kept = np.unique(reach[moving].indices)
+    index = np.union1d(kept, np.flatnonzero(is_free))
+    new = np.full(mesh.n_vertices, -1)
+    new[index] = np.arange(len(index))
+    faces = new[mesh.faces]
+    faces = faces[(faces >= 0).all(axis=1)]
+    if not len(faces):
+        raise InputError("the free vertices belong to no face: free a vertex that does")
+    piece = Mesh(mesh.vertices[index], faces)
+
+    # Find the edges of the piece among those of the whole. Both lists are sorted, and renumbering
+    # keeps the order.
+    n = mesh.n_vertices
+    whole_code = cells.edges[:, 0] * n + cells.edges[:, 1]
+    piece_code = index[piece.edges[:, 0]] * n + index[piece.edges[:, 1]]
+    edge = np.searchsorted(whole_code, piece_code)
+    membership = cells.membership.copy()
+    membership.data = membership.data * np.repeat(moving, np.diff(membership.indptr)).astype(
+        np.int8
+    )
+    membership.eliminate_zeros()
+    piece_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
+    return Submesh(piece, piece_cells, np.flatnonzero(~is_free[index]), index, mesh)
+
+
+def _mask(free: ArrayLike, n: int) -> np.ndarray:
+    given = np.asarray(free)
+    if given.dtype == bool:
+        if given.shape != (n,):
+            raise InputError(f"the mask of free vertices has shape {given.shape}: give ({n},)")
+        mask = given
+    else:
+        if given.ndim != 1 or given.dtype.kind not in "iu":
+            raise InputError("free must be a list of vertex indices, or a mask of booleans")
+        bad = given[(given < 0) | (given >= n)]
+        if bad.size:
+            raise InputError(f"free vertex {bad[0]} is out of range: vertices are 0 to {n - 1}")
+        mask = np.zeros(n, bool)
+        mask[given] = True
+    if not mask.any():
+        raise InputError("no vertex is free, so nothing can deform: give at least one")
+    return mask

@@ -1,0 +1,125 @@
+"""Pictures of meshes, drawn without a display. They need the extra ``viewer``."""
+
+import os
+from collections.abc import Sequence
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.files import check_place, write_atomically
+from jaxdeform._mesh.mesh import Mesh
+
+
+def render(
+    path: str | os.PathLike,
+    mesh: Mesh,
+    poses: Sequence[ArrayLike],
+    *,
+    titles: Sequence[str] = (),
+    values: Sequence[ArrayLike | None] = (),
+    label: str = "rigidity",
+    width: int = 500,
+) -> None:
+    """Draw poses of a mesh side by side, all at the same scale, into a PNG file.
+
+    **Arguments**
+
+    - path: a ``.png`` file; replaced as a whole or not at all.
+    - mesh: gives the faces.
+    - poses: a list of positions (vertices, 3).
+    - titles: one text per pose.
+    - values: for each pose an array (vertices,), a number, or None; shown as colour, on a
+      logarithmic scale if all are positive and they differ by more than a factor of 5.
+    - label: the name of the values.
+    - width: the width of each view, in pixels.
+
+    **Raises** InputError: the name does not end in .png; the folder cannot be written; pyvista is
+    not installed.
+
+    Example:
+        >>> import jaxdeform as jd, pathlib, tempfile
+        >>> mesh = jd.shapes.square()
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "square.png"
+        >>> jd.render(path, mesh, [mesh.vertices])
+        >>> path.stat().st_size > 1000
+        True
+    """
+    path = Path(path)
+    check_picture_path(path)
+    import pyvista  # slow to import, and needed only here
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    # Without a display VTK falls back to drawing in memory, which is what we want: no warning.
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    arrays = [np.asarray(pose, np.float64) for pose in poses]
+    plotter = pyvista.Plotter(
+        shape=(1, len(arrays)), window_size=[width * len(arrays), int(1.3 * width)], off_screen=True
+    )
+    shown = [v for v in values if v is not None]
+    for k, pose in enumerate(arrays):
+        plotter.subplot(0, k)
+        color = values[k] if k < len(values) else None
+        options: dict[str, Any] = {"color": "lightsteelblue"}
+        if color is not None:
+            scalars = np.broadcast_to(np.asarray(color, np.float64), len(pose))
+            options = {"scalars": scalars, **_color_scale(shown, label)}
+        surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
+        plotter.add_mesh(surface, show_edges=mesh.n_faces < 5000, line_width=0.5, **options)
+        if k < len(titles):
+            plotter.add_text(titles[k], font_size=10)
+    # Look along the direction in which all poses together are thinnest.
+    together = np.concatenate(arrays)
+    plotter.link_views()
+    plotter.camera_position = _camera(together)
+    # The decorator of pyvista hides self from pyright.
+    plotter.reset_camera(bounds=_bounds(together))  # pyright: ignore[reportCallIssue]
+    image = np.asarray(plotter.screenshot(return_img=True))
+    plotter.close()
+    write_atomically(path, partial(_write_png, image))
+
+
+def _color_scale(shown: Sequence[ArrayLike], label: str) -> dict[str, Any]:
+    """Return the options of pyvista that all poses share, so that colours can be compared."""
+    low, high = (min(map(np.min, shown)), max(map(np.max, shown))) if shown else (0.0, 1.0)
+    return {
+        "clim": (low, high) if high > low else (low, low + 1),
+        "log_scale": bool(low > 0 and high > 5 * low),
+        "cmap": "viridis",
+        "scalar_bar_args": {"title": label},
+    }
+
+
+def _write_png(image: np.ndarray, name: str) -> None:
+    from PIL import Image  # comes with pyvista
+
+    Image.fromarray(image).save(name, format="PNG")
+
+
+def check_picture_path(path: Path) -> None:
+    """Raise InputError if no picture can be written at this path."""
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: pictures are PNG files: use a .png name")
+    if find_spec("pyvista") is None:
+        raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'")
+    check_place(path)
+
+
+def _camera(points: Float[np.ndarray, "points 3"]):
+    extent = np.ptp(points, axis=0)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    thin, up = int(np.argmin(extent)), int(np.argmax(extent))
+    if extent[1] > 0.8 * extent[up] and thin != 1:
+        up = 1  # most meshes stand upright along y
+    direction = np.full(3, 0.35)
+    direction[thin], direction[up] = 1.0, 0.25
+    return [middle + 3 * np.linalg.norm(extent) * direction, middle, np.eye(3)[up]]
+
+
+def _bounds(points: Float[np.ndarray, "points 3"]) -> list[float]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return [value for pair in zip(low, high, strict=True) for value in pair]

@@ -1,0 +1,45 @@
+"""How a computation ended, as a sentence."""
+
+import operator
+from functools import reduce
+
+import equinox as eqx
+from jaxtyping import Array, Bool
+
+
+class Result(eqx.Enumeration):
+    """How a computation ended; ``jd.Result[result]`` is the sentence.
+
+    Compare with a member: ``out.result == jd.Result.converged`` (one boolean for each member of a
+    batch).
+    """
+
+    __module__ = "jaxdeform"  # where users find it, also in its repr
+
+    steps_done = "Ran the number of steps that was asked for."
+    converged = "Converged: a further step would change the objective by less than the tolerance."
+    step_limit = (
+        "Stopped at the step limit before the tolerance was reached: the shape is usable, but "
+        "allow more steps (or loosen the tolerance) if you rely on derivatives."
+    )
+    not_finite = (
+        "Not finite: a local step failed, or the numbers overflowed. The cells at fault are those "
+        "whose `transforms` are not finite (`Solution.explain` names them). Try the default local "
+        "step, float64, or another scale of the targets and the rigidity (its unit is length "
+        "squared)."
+    )
+    fitted = "Converged: a further step would not lower the misfit visibly."
+    settled = "Stopped: rigidity changed by less than the threshold."
+    evaluation_limit = (
+        "Stopped at the limit of evaluations: allow more (max_evaluations), or start nearer."
+    )
+    fit_not_finite = (
+        "Not finite: a deformation overflowed. Check the scale of the mesh, the observed poses and "
+        "the start (rigidity is length squared), or use float64."
+    )
+
+
+def succeeded(result: Result) -> Bool[Array, "*batch"]:
+    """Return whether a computation ended as it should."""
+    good = Result.steps_done, Result.converged, Result.fitted, Result.settled
+    return reduce(operator.or_, (result == member for member in good))

@@ -1,0 +1,267 @@
+"""The command line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxdeform as jd
+from jaxdeform._apps.cli import main
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Return a function that runs the command line: arguments -> (exit code, stdout, stderr)."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["jaxdeform", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def lower_and_upper(bar):
+    y = bar.vertices[:, 1]
+    return np.flatnonzero(y < 6), np.flatnonzero(y > 145)
+
+
+@pytest.fixture
+def files(tmp_path, bar):
+    """A bar, handles that bend it by 90 degrees (JSON and survey), a rigidity per vertex."""
+    jd.save_mesh(tmp_path / "bar.off", bar)
+    low, high = lower_and_upper(bar)
+    turn = {"axis": [0, 0, 1], "degrees": -90, "center": [0, 75.5, 0]}
+    groups = [{"vertices": low.tolist()}, {"vertices": high.tolist(), "rotation": turn}]
+    (tmp_path / "bend.json").write_text(json.dumps({"handles": groups}))
+    status = np.ones(722, int)
+    status[low], status[high] = 0, 2
+    (tmp_path / "bend.sel").write_text("\n".join(map(str, status)))
+    (tmp_path / "bend.def").write_text("0 1 0 -75.5\n-1 0 0 75.5\n0 0 1 0\n0 0 0 1\n")
+    values = np.where(bar.vertices[:, 1] < 75.5, 0.01, 30.0)
+    jd.save_mesh(tmp_path / "rigidity.ply", bar, rigidity=values)
+    jd.save_mesh(tmp_path / "short.ply", jd.shapes.square(), rigidity=1.0)
+    jd.save_mesh(tmp_path / "plain.ply", bar)
+    return tmp_path
+
+
+def drawn(path):
+    """Return the pixels that are not background, as a share, and the number of their colours."""
+    pixels = np.asarray(Image.open(path).convert("RGB"))
+    ink = (pixels != pixels[0, -1]).any(axis=2)
+    return ink.mean(), len(np.unique(pixels[ink], axis=0))
+
+
+def test_demo(run, tmp_path, bar):
+    code, out, err = run("demo", "--out", tmp_path / "new" / "folder")
+    assert (code, err) == (0, "")
+    folder = tmp_path / "new" / "folder"
+    names = {"soft", "stiff", "soft-below-stiff"}
+    assert {path.name for path in folder.iterdir()} == {f"{n}.ply" for n in names} | {"demo.png"}
+    assert all(name in out for name in names)
+    share, colours = drawn(folder / "demo.png")
+    assert 0.02 < share < 0.9
+    assert colours > 100
+    _, high = lower_and_upper(bar)
+    poses = []
+    for name in names:
+        mesh = jd.load_mesh(folder / f"{name}.ply")
+        turned = np.stack([bar.vertices[high, 1] - 75.5, 75.5 - bar.vertices[high, 0]], axis=1)
+        np.testing.assert_allclose(mesh.vertices[high, :2], turned, atol=1e-9)
+        poses.append(mesh.vertices)
+    for k in range(3):
+        assert np.abs(poses[k] - poses[k - 1]).max() > 1.0  # of a bar 151 long
+    rigidity = jd.load_rigidity(folder / "soft-below-stiff.ply")
+    assert sorted(set(rigidity)) == [0.01, 30.0]
+    assert rigidity[bar.vertices[:, 1] < 60].max() == 0.01
+
+
+def test_deform_by_json_with_all_settings(run, files, bar):
+    code, out, err = run(
+        "deform", files / "bar.off", "--handles", files / "bend.json", "--rigidity", 2.5,
+        "--rings", 2, "--steps", 7, "--normals", "-o", files / "out.ply",
+        "--picture", files / "out.png",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    assert "after 7 steps" in out
+    assert str(files / "out.ply") in out
+    handles = np.concatenate(lower_and_upper(bar))
+    problem = jd.precompute(bar, handles, cells=jd.rings(bar, 2))
+    targets = jd.bend(bar.vertices[handles], 90.0)
+    want = jd.deform(problem, targets, 2.5, solver=jd.Alternating(7), normals=True)
+    np.testing.assert_allclose(jd.load_mesh(files / "out.ply").vertices, want.vertices, atol=1e-8)
+    np.testing.assert_array_equal(jd.load_rigidity(files / "out.ply"), np.full(722, 2.5))
+    share, colours = drawn(files / "out.png")
+    assert share > 0.02
+    assert colours > 10
+
+
+def test_deform_by_survey_files_with_a_rigidity_per_vertex(run, files, bar):
+    """Written over the mesh it was read from, which is safe."""
+    code, out, err = run(
+        "deform", files / "bar.off", "--handles", files / "bend.sel", "--rigidity",
+        files / "rigidity.ply", "-o", files / "bar.off", "--motion", files / "bend.def",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    assert "Converged" in out
+    handles = np.sort(np.concatenate(lower_and_upper(bar)))
+    values = jd.load_rigidity(files / "rigidity.ply")
+    want = jd.deform(jd.precompute(bar, handles), jd.bend(bar.vertices[handles], 90.0), values)
+    # Two starts of the same iteration, whose targets differ by rounding.
+    np.testing.assert_allclose(jd.load_mesh(files / "bar.off").vertices, want.vertices, atol=1e-4)
+
+
+def test_inspect(run, files):
+    code, out, err = run("inspect", files / "bar.off")
+    assert (code, err) == (0, "")
+    assert "vertices               722" in out
+    assert "nothing unusual" in out
+    (files / "flat.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n")
+    code, out, _ = run("inspect", files / "flat.off")
+    assert code == 0
+    assert "1 faces have no area (face 0): jd.repair drops them" in out
+    code, out, err = run("inspect", files / "none[b].off")
+    assert (code, out) == (2, "")
+    assert err == f"jaxdeform: {files}/none[b].off: cannot be read " + (
+        "(No such file or directory): check the name\n"
+    )
+
+
+MISTAKES = {
+    "is neither a number nor": {"--rigidity": "soft"},
+    "--rigidity nan: rigidity is nan: it must be": {"--rigidity": "nan"},
+    "--rigidity -1: rigidity is -1.0": {"--rigidity": "-1"},
+    "inf": {"--rigidity": "inf"},
+    "short.ply: rigidity has shape (9,): give one number": {"--rigidity": "{}/short.ply"},
+    "plain.ply: its vertices have no property 'rigidity'": {"--rigidity": "{}/plain.ply"},
+    "bar.off: rigidity is kept in .ply files only": {"--rigidity": "{}/bar.off"},
+    "none.off: cannot be read": {"mesh": "{}/none.off"},
+    "bend.json: unknown suffix '.json'": {"mesh": "{}/bend.json"},
+    "none.json: cannot be read": {"--handles": "{}/none.json"},
+    "handle files end in .json or .sel": {"--handles": "{}/bar.off"},
+    "none.def: cannot be read": {"--handles": "{}/bend.sel", "--motion": "{}/none.def"},
+    "out.xyz: unknown suffix '.xyz'": {"-o": "{}/out.xyz"},
+    "cannot write there: make the folder": {"-o": "{}/none/out.ply"},
+    "is a folder: give the name of a file": {"-o": "{}/folder.ply"},
+    "out.jpg: pictures are PNG files": {"--picture": "{}/out.jpg"},
+    "out.png: cannot write there: make the folder": {"--picture": "{}/none/out.png"},
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_a_mistake_is_one_line_before_any_work(run, files, monkeypatch, message):
+    given = {
+        "mesh": "{}/bar.off", "--handles": "{}/bend.json", "--rigidity": "1", "-o": "{}/out.ply",
+        **MISTAKES[message],
+    }  # fmt: skip
+    monkeypatch.setattr(jd, "precompute", lambda *_, **__: pytest.fail("began to work"))
+    (files / "folder.ply").mkdir()
+    (files / "out.ply").write_text("old")
+    before = sorted(os.listdir(files))
+    mesh = given.pop("mesh").format(files)
+    code, out, err = run("deform", mesh, *(w.format(files) for kv in given.items() for w in kv))
+    assert (code, out) == (2, "")
+    assert err.startswith("jaxdeform: ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert (files / "out.ply").read_text() == "old"
+    assert sorted(os.listdir(files)) == before
+
+
+def test_mistakes_found_while_precomputing(run, files):
+    (files / "one.json").write_text('{"handles": [{"vertices": [0]}]}')
+    two = jd.shapes.bar()
+    v, f = two.vertices, np.asarray(two.faces)
+    jd.save_mesh(
+        files / "two.off", jd.Mesh(np.concatenate([v, v + 999]), np.concatenate([f, f + 722]))
+    )
+    code, _, err = run(
+        "deform", files / "two.off", "--handles", files / "one.json", "--rigidity", 1,
+        "-o", files / "out.off",
+    )  # fmt: skip
+    assert code == 2
+    assert err.startswith("jaxdeform: the connected component with vertex 722")
+    assert not (files / "out.off").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("bend",),
+        ("inspect",),
+        ("deform", "bar.off"),
+        ("inspect", "bar.off", "--loud"),
+        ("deform", "m.off", "--handles", "h", "--rigidity", "1", "-o", "o.off", "--steps", "0"),
+        ("deform", "m.off", "--handles", "h", "--rigidity", "1", "-o", "o.off", "--rings", "x"),
+    ],
+)
+def test_wrong_usage_ends_with_code_2(run, arguments):
+    code, out, err = run(*arguments)
+    assert code == 2
+    assert "Usage" in out + err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("command", ["demo", "inspect", "deform"])
+def test_help(run, command):
+    code, out, _ = run(command, "--help")
+    assert code == 0
+    assert "Usage" in out
+
+
+def test_a_folder_that_cannot_be_made(run, files):
+    code, _, err = run("demo", "-o", files / "bar.off" / "x")
+    assert code == 2
+    assert err.startswith(f"jaxdeform: {files}/bar.off/x: cannot be made")
+
+
+def test_importing_the_command_line_does_not_turn_on_float64():
+    code = "import jax, jaxdeform._apps.cli; print(jax.config.jax_enable_x64)"
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "False\n"
+
+
+def test_commands_compute_in_float64(run, files, monkeypatch):
+    seen = []
+    monkeypatch.setattr(jd, "inspect", lambda _: seen.append(jax.config.jax_enable_x64))
+    jax.config.update("jax_enable_x64", False)
+    try:
+        assert run("inspect", files / "bar.off")[0] == 0
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert seen == [True]
+
+
+def test_ctrl_c_leaves_old_files_whole(files):
+    (files / "out.ply").write_text("old")
+    before = sorted(os.listdir(files))
+    process = subprocess.Popen(
+        [
+            Path(sys.executable).parent / "jaxdeform", "deform", files / "bar.off", "--handles",
+            files / "bend.json", "--rigidity", "1", "-o", files / "out.ply", "--steps", "1000000",
+        ],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert "precomputed" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == "jaxdeform: interrupted; no file was left half-written\n"
+    assert (files / "out.ply").read_text() == "old"
+    assert sorted(os.listdir(files)) == before

@@ -1,0 +1,37 @@
+"""Handles found."""
+
+import numpy as np
+import pytest
+from helpers import NOISE, noisy, real_mesh
+
+import jaxdeform as jd
+
+
+def test_handles_are_found_exactly(bar, bar_problem, pose_of):
+    pose = pose_of(1.0)
+    np.testing.assert_array_equal(jd.find_handles(bar, pose), bar_problem.handles)
+    groups = jd.find_handle_groups(bar, pose)
+    assert sorted(round(float(group.degrees[0]), 6) for group in groups) == [0.0, 90.0]
+    for group in groups:
+        moved = bar.vertices[group.vertices] @ group.rotations[0].T + group.translations[0]
+        np.testing.assert_allclose(moved, pose[group.vertices], atol=1e-9)
+
+
+def test_handles_are_found_in_noise_and_in_several_poses(bar, bar_problem, pose_of):
+    poses = np.stack([noisy(bar, pose_of(value), seed) for seed, value in enumerate((1.0, 30.0))])
+    with pytest.raises(jd.InputError, match="raise the tolerance"):
+        jd.find_handles(bar, poses)
+    found = jd.find_handles(bar, poses, tolerance=6 * NOISE)
+    assert np.isin(bar_problem.handles, found).mean() > 0.98
+    assert np.isin(found, bar_problem.handles).mean() > 0.95
+
+
+def test_finding_handles_does_not_depend_on_where_the_pose_lies(bar, bar_problem, pose_of):
+    moved = np.asarray(jd.rotate(pose_of(1.0), 40.0, axis=[1.0, 2.0, 3.0])) + 7.0
+    np.testing.assert_array_equal(jd.find_handles(bar, moved), bar_problem.handles)
+
+
+def test_the_phalanges_of_a_finger_are_found():
+    rest, pose = real_mesh("finger0.ply"), real_mesh("finger1.ply")
+    groups = jd.find_handle_groups(rest, pose.vertices, tolerance=1e-4)
+    assert [len(group.vertices) > 150 for group in groups] == [True] * 4

@@ -1,0 +1,205 @@
+"""Handle files: targets against scipy's matrix exponential, and every way to write one wrongly."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import EXACT, REAL, real_mesh
+from scipy.linalg import expm
+
+import jaxdeform as jd
+
+
+def write(tmp_path, *groups):
+    path = tmp_path / "handles.json"
+    path.write_text(json.dumps({"handles": groups}))
+    return path
+
+
+def turned(points, axis, degrees, center):
+    x, y, z = np.array(axis) / np.linalg.norm(axis) * np.radians(degrees)
+    matrix = expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    return (points - center) @ matrix.T + center
+
+
+def test_json_groups_move_as_they_say(tmp_path, bar):
+    groups = [
+        {"vertices": [5, 3], "name": "stays"},
+        {"vertices": [700, 10, 12], "translation": [1, -2, 0.5]},
+        {"vertices": [20, 30, 40], "rotation": {"axis": [0, 0, 2], "degrees": 90}},
+        {
+            "vertices": [50, 60],
+            "rotation": {"axis": [1, -1, 3], "degrees": -400, "center": [1, 2, 3]},
+            "translation": [0, 10, 0],
+        },
+        {"vertices": [70, 71], "targets": [[1, 2, 3], [4, 5, 6.5]]},
+    ]
+    handles, targets = jd.load_handles(write(tmp_path, *groups), bar)
+    assert handles.tolist() == [5, 3, 700, 10, 12, 20, 30, 40, 50, 60, 70, 71]
+    v = bar.vertices
+    turn = v[[20, 30, 40]]
+    want = [
+        v[[5, 3]],
+        v[[700, 10, 12]] + [1, -2, 0.5],
+        turned(turn, [0, 0, 1], 90, turn.mean(axis=0)),
+        turned(v[[50, 60]], [1, -1, 3], -400, np.array([1, 2, 3])) + np.array([0, 10, 0]),
+        [[1, 2, 3], [4, 5, 6.5]],
+    ]
+    np.testing.assert_allclose(targets, np.concatenate(want), atol=EXACT)
+
+
+GOOD = {"vertices": [0, 1]}
+BAD_GROUPS = {
+    'group 0 has no "vertices"': [{"vertex": [0]}],
+    'group 1 has no "vertices"': [GOOD, [3, 4]],
+    "group 0: no handles": [{"vertices": []}],
+    "group 0: handles have shape": [{"vertices": 3}],
+    "group 0: handles must be integers, got float64": [{"vertices": [0.5]}],
+    "group 0: handle 722 .position 1. is out of range": [{"vertices": [0, 722]}],
+    "group 0: handle -1 ": [{"vertices": [-1]}],
+    "group 0: vertex 3 is a handle 2 times": [{"vertices": [3, 3]}],
+    "handles.json: vertex 1 is a handle 2 times": [GOOD, {"vertices": [1, 2]}],
+    "group 1 has the unknown key 'traslation': use vertices": [
+        GOOD,
+        {"vertices": [5], "traslation": [0, 0, 1]},
+    ],
+    "group 0: translation: give 3 finite numbers": [{**GOOD, "translation": [0, 1]}],
+    "group 0: translation: give numbers": [{**GOOD, "translation": ["a", 1, 2]}],
+    "group 0: targets: give 2 x 3 finite": [{**GOOD, "targets": [[0, 1, 2]]}],
+    "group 0: targets: give 2 x 3 finite numbers": [
+        {**GOOD, "targets": [[0, 1, float("nan")], [0, 0, 0]]}
+    ],
+    "group 0 has targets and a motion": [
+        {**GOOD, "targets": [[0, 0, 0], [1, 1, 1]], "translation": [0, 0, 1]}
+    ],
+    'group 0: rotation needs "axis" and "degrees"': [{**GOOD, "rotation": {"axis": [0, 0, 1]}}],
+    "group 0: the rotation axis has length zero": [
+        {**GOOD, "rotation": {"axis": [0, 0, 0], "degrees": 9}}
+    ],
+    "group 0: axis: give numbers": [{**GOOD, "rotation": {"axis": "z", "degrees": 9}}],
+    "group 0: degrees: give one finite number": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": [1, 2]}}
+    ],
+    "group 0: center: give 3 finite numbers": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": 1, "center": 5}}
+    ],
+    "group 0: rotation has the unknown key 'centre': use axis": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": 1, "centre": [0, 0, 0]}}
+    ],
+}
+
+
+@pytest.mark.parametrize("message", BAD_GROUPS)
+def test_bad_groups_are_named(tmp_path, bar, message):
+    path = write(tmp_path, *BAD_GROUPS[message])
+    with pytest.raises(jd.InputError, match=message) as error:
+        jd.load_handles(path, bar)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is not valid JSON .*line 1 column 1"),
+        (b'{"handles": [{"vertices": [0, 1]}', "is not valid JSON"),
+        (b"[" * 100_000, "is not valid JSON"),
+        (b"[1, 2]", r'give {"handles": \[group'),
+        (b'{"handle": []}', r'give {"handles": \[group'),
+        (b'{"handles": {}}', r'give {"handles": \[group'),
+        (b'{"handles": []}', "with at least one group"),
+        (b"\xff\xfe\x00", "is not a text file"),
+    ],
+)
+def test_bad_json_is_named(tmp_path, bar, content, message):
+    path = tmp_path / "handles.json"
+    path.write_bytes(content)
+    with pytest.raises(jd.InputError, match=message) as error:
+        jd.load_handles(path, bar)
+    assert str(path) in str(error.value)
+
+
+def test_a_byte_order_mark_does_no_harm(tmp_path, bar):
+    path = tmp_path / "handles.JSON"
+    path.write_text(json.dumps({"handles": [GOOD]}), encoding="utf-8-sig")
+    assert jd.load_handles(path, bar).handles.tolist() == [0, 1]
+
+
+MATRIX = "# moves\n1 0 0 10\n0 0 -1 0\n\n0 1 0 -5\n0 0 0 1\n"
+
+
+def survey(tmp_path, status, matrix=MATRIX):
+    (tmp_path / "h.sel").write_text("# status\n" + status)
+    (tmp_path / "h.def").write_text(matrix)
+    return tmp_path / "h.sel"
+
+
+def test_survey_files(tmp_path):
+    mesh = jd.shapes.square()
+    path = survey(tmp_path, "0 1 2\n1 1 1\n2\n1\n0 # last\n")
+    handles, targets = jd.load_handles(path, mesh)
+    assert handles.tolist() == [0, 2, 6, 8]
+    v = mesh.vertices[handles]
+    np.testing.assert_allclose(targets[[0, 3]], v[[0, 3]], atol=EXACT)
+    want = np.stack([v[:, 0] + 10, -v[:, 2], v[:, 1] - 5], axis=1)
+    np.testing.assert_allclose(targets[[1, 2]], want[[1, 2]], atol=EXACT)
+    other = tmp_path / "other.def"
+    other.write_text("1 0 0 0\n0 1 0 0\n0 0 1 1\n0 0 0 1\n")
+    np.testing.assert_allclose(
+        jd.load_handles(path, mesh, other).targets, v + [[0, 0, k] for k in (0, 1, 1, 0)]
+    )
+
+
+def test_bad_survey_files_are_named(tmp_path):
+    mesh = jd.shapes.square()
+    good = "0 1 2 1 1 1 2 1 0"
+    bad = {
+        "h.sel: has 8 numbers, but the mesh has 9 vertices": (good[2:], MATRIX),
+        "h.sel: vertex 4 is '3': give 0 .fixed., 1": ("0 1 2 1 3 1 2 1 0", MATRIX),
+        "h.sel: vertex 0 is 'x'": ("x 1 2 1 1 1 2 1 0", MATRIX),
+        "h.sel: no handles": ("1 " * 9, MATRIX),
+        "h.def: the matrix: give 4 x 4 finite numbers": (good, MATRIX[:-8]),
+        "h.def: the matrix: give numbers": (good, MATRIX + "1\n"),
+        "h.def: the matrix: give 4 x 4 finite": (good, MATRIX.replace("10", "inf")),
+        "h.def: the matrix ends in the row": (good, "1 0 0 0\n0 1 0 0\n0 0 1 0\n1 2 3 1\n"),
+    }
+    for message, (status, matrix) in bad.items():
+        with pytest.raises(jd.InputError, match=message):
+            jd.load_handles(survey(tmp_path, status, matrix), mesh)
+    path = survey(tmp_path, good)
+    with pytest.raises(jd.InputError, match=r"none.def: cannot be read \(No such file"):
+        jd.load_handles(path, mesh, tmp_path / "none.def")
+    (tmp_path / "h.def").unlink()
+    with pytest.raises(jd.InputError, match=r"h.def: cannot be read"):
+        jd.load_handles(path, mesh)
+
+
+def test_other_files(tmp_path, bar):
+    for name, message in {
+        "none.json": "cannot be read .No such file",
+        "none.sel": "cannot be read .No such file",
+        "h.txt": "end in .json or .sel, not '.txt'",
+    }.items():
+        with pytest.raises(jd.InputError, match=message):
+            jd.load_handles(tmp_path / name, bar)
+    with pytest.raises(jd.InputError, match=r"holds its motions itself: leave out x\.def"):
+        jd.load_handles(write(tmp_path, GOOD), bar, "x.def")
+
+
+def test_the_survey_s_cylinder():
+    mesh = real_mesh("cylinder.off")
+    handles, targets = jd.load_handles(REAL / "cylinder.sel", mesh)
+    words = [
+        word
+        for line in (REAL / "cylinder.sel").read_text().splitlines()
+        if not line.startswith("#")
+        for word in line.split()
+    ]
+    assert handles.tolist() == [k for k, word in enumerate(words) if word != "1"]
+    fixed = np.array([words[k] == "0" for k in handles])
+    assert 0 < fixed.sum() < len(handles)
+    v = mesh.vertices[handles]
+    np.testing.assert_array_equal(targets[fixed], v[fixed])
+    # The file says so: 120 degrees about y, to six digits, and a shift.
+    turn = turned(v[~fixed], [0, -1, 0], 120, np.zeros(3)) + np.array([5.196152, 0, 9])
+    np.testing.assert_allclose(targets[~fixed], turn, atol=1e-5)

@@ -1,0 +1,263 @@
+"""OBJ, OFF, PLY and STL as other programs write them, whole and damaged."""
+
+import igl
+import numpy as np
+import pytest
+from helpers import EXACT
+
+import jaxdeform as jd
+
+SUFFIXES = (".obj", ".off", ".ply", ".stl")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_libigl_reads_what_we_write(tmp_path, odd, suffix):
+    path = tmp_path / f"m{suffix}"
+    jd.save_mesh(path, odd)
+    v, f = igl.read_triangle_mesh(str(path))
+    rtol = 1e-6 if suffix == ".stl" else EXACT  # STL is single precision
+    np.testing.assert_allclose(v[f], odd.vertices[odd.faces], rtol=rtol)
+
+
+@pytest.mark.parametrize("encoding", [igl.FileEncoding.Binary, igl.FileEncoding.Ascii])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_we_read_what_libigl_writes(tmp_path, odd, suffix, encoding):
+    path = tmp_path / f"m{suffix}"
+    igl.write_triangle_mesh(str(path), odd.vertices, np.asarray(odd.faces), encoding)
+    back = jd.load_mesh(path)
+    # libigl writes text with six digits or more.
+    corners = back.vertices[back.faces]
+    np.testing.assert_allclose(corners, odd.vertices[odd.faces], rtol=1e-5)
+
+
+def test_stl_keeps_single_precision_and_joins_equal_corners(tmp_path, bar):
+    jd.save_mesh(tmp_path / "bar.stl", bar)
+    back = jd.load_mesh(tmp_path / "bar.stl")
+    assert (back.n_vertices, back.n_faces) == (722, 1440)
+    single = bar.vertices.astype(np.float32)
+    np.testing.assert_array_equal(back.vertices[back.faces], single[bar.faces])
+
+
+PLY = """ply
+format ascii 1.0
+comment by hand
+element vertex 4
+property float rigidity
+property double x
+property float y
+property float z
+property uchar red
+element face 2
+{flags}
+property list uchar int vertex_index
+element edge 1
+property int a
+end_header
+0.5 0 0 0 255
+1.5 1 0 0 255
+2.5 1 1 0 255
+3.5 0 1 0 255
+{first}
+{second}
+0
+"""
+
+
+@pytest.mark.parametrize(
+    ("flags", "prefix"), [("property float area", "7 "), ("property list uchar int t", "2 8 9 ")]
+)
+def test_ply_properties_in_any_order(tmp_path, flags, prefix):
+    path = tmp_path / "m.ply"
+    text = PLY.format(flags=flags, first=prefix + "3 0 1 2", second=prefix + "3 0 2 3")
+    path.write_text(text)
+    mesh = jd.load_mesh(path)
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert jd.load_rigidity(path).tolist() == [0.5, 1.5, 2.5, 3.5]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_ply_of_both_byte_orders_with_further_lists(tmp_path, order):
+    vertex = np.dtype([("x", order + "f4"), ("y", order + "f4"), ("z", order + "f8")])
+    face = np.dtype(
+        [("n", "u1"), ("uv", order + "f4", (6,)), ("m", order + "u4"), ("f", order + "i2", (3,))]
+    )
+    vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0.1)], vertex)
+    faces = np.array([(6, np.arange(6), 3, [2, 0, 1])], face)
+    head = f"""ply
+format binary_{"little" if order == "<" else "big"}_endian 1.0
+element vertex 3
+property float x
+property float y
+property double z
+element face 1
+property list uchar float texcoord
+property list uint short vertex_indices
+end_header
+"""
+    path = tmp_path / "m.ply"
+    path.write_bytes(head.encode() + vertices.tobytes() + faces.tobytes())
+    mesh = jd.load_mesh(path)
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0.1]]
+    assert mesh.faces.tolist() == [[2, 0, 1]]
+
+
+def test_dialects(tmp_path):
+    texts = {
+        "counts.off": "\ufeffOFF 3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2",
+        "comments.off": "# by hand\nOFF\n\n3 1 0 # counts\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 255 0 0\n",
+        "colours.off": "COFF\n3 1 0\n0 0 0 9 9 9 9\n1 0 0 9 9 9 9\n0 1 0 9 9 9 9\n3 0 1 2\n",
+        "windows.off": "OFF\r\n3 1 0\r\n0 0 0\r\n1 0 0\r\n0 1 0\r\n3 0 1 2\r\n",
+        "full.obj": "o x\nv 0 0 0 1\nv 1 0 0\nvt 0 0\nvn 0 0 1\nv 0 1 0\ns off\nf 1/1/1 2//1 3/1\n",
+        "back.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 9 9 9\n",
+        "text.stl": """solid a#b
+ facet normal 0 0 1
+  outer loop
+   vertex 0 0 0
+   vertex 1 0 -0.0
+   vertex 0 1 0
+  endloop
+ endfacet
+endsolid a#b""",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_bytes(text.encode())
+        mesh = jd.load_mesh(tmp_path / name)
+        assert mesh.vertices[mesh.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]], name
+        assert mesh.n_faces == 1
+
+
+BAD_FILES = {
+    "empty.off": (b"", "is empty"),
+    "blank.obj": (b" \n\n", "is empty"),
+    "comment.off": (b"# OFF\n", "does not start with OFF"),
+    "other.off": (b"hello", "does not start with OFF"),
+    "four.off": (b"4OFF\n1 0 0\n0 0 0 1\n", "does not start with OFF"),
+    "counts.off": (b"OFF\nthree 1 0\n", "no counts"),
+    "negative.off": (b"OFF\n-3 1 0\n0 0 0\n", "holds fewer"),
+    "short.off": (b"OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "holds fewer"),
+    "word.off": (b"OFF\n3 1 0\n0 0 x\n1 0 0\n0 1 0\n3 0 1 2\n", "'0 0 x' is not a vertex"),
+    "two.off": (b"OFF\n3 1 0\n0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "'0 0' is not a vertex"),
+    "nan.off": (b"OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n", r"nan.off: vertex 0 is"),
+    "range.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", r"range.off: face 0 \[0, 1, 3\]"),
+    "flat.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n", "flat.off: face 0 .* no area"),
+    "quad.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2 0\n", "face 0 is a polygon with 4"),
+    "edge.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n2 0 1\n", "face 0 is a face with 2 corners"),
+    "huge.off": (b"OFF\n1 1 0\n0 0 0\n3 0 1 99999999999999999999\n", "is not a face"),
+    "points.off": (b"OFF\n1 0 0\n0 0 0\n", "holds no triangles"),
+    "quad.obj": (b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n", "line 5 is a polygon"),
+    "zero.obj": (b"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 0 1 2\n", "face 0 .* out of range"),
+    "range.obj": (b"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 4\n", "face 0 .* out of range"),
+    "huge.obj": (b"v 0 0 0\nf 1 2 99999999999999999999\n", "out of range"),
+    "word.obj": (b"v 0 0 zero\nf 1 2 3\n", "is not a vertex"),
+    "slash.obj": (b"v 0 0 0\nf / 2 3\n", "line 2 is not a face"),
+    "points.obj": (b"v 0 0 0\n", "holds no triangles"),
+    "junk.obj": ("Ünïcödé\n".encode() * 9, "holds no triangles"),
+    "junk.stl": (bytes(range(256)), "neither ASCII STL"),
+    "solid.stl": (b"solid x\n", "does not end"),
+    "two.stl": (
+        b"solid\nfacet\nvertex 0 0 0\nvertex 1 0 0\nendfacet\nendsolid\n",
+        "face 0 is a face with 2 corners",
+    ),
+    "open.stl": (b"solid\nfacet\nvertex 0 0 0\nendsolid\n", "endfacet"),
+    "none.stl": (b"solid\nendsolid\n", "holds no triangles"),
+    "junk.ply": (b"\xff\xfe\x00ply", "no complete PLY header"),
+    "head.ply": (b"ply\nformat ascii 1.0\nend_header\n", "without vertices and faces"),
+    "many.ply": (
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\nproperty float x\n"
+        b"property float y\nproperty float z\nelement face 1\n"
+        b"property list uchar int vertex_indices\nend_header\n\0\0",
+        "shorter than its header",
+    ),
+    "kind.ply": (
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nelement face 1\nend_header\n",
+        "without vertices",
+    ),
+    "order.ply": (
+        b"ply\nformat ascii 1.0\nelement face 0\nproperty list uchar int vertex_indices\n"
+        b"element vertex 0\nproperty float x\nend_header\n",
+        "unusual order",
+    ),
+    "wrong.ply": (PLY.replace("ascii", "utf").encode(), "unknown PLY format 'utf'"),
+    "mesh.vtk": (b"vtk", r"unknown suffix '.vtk': use one of .obj, .off, .ply, .stl"),
+    "mesh": (b"", "unknown suffix ''"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_are_named(tmp_path, name):
+    content, message = BAD_FILES[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(jd.InputError, match=message) as error:
+        jd.load_mesh(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_ply_faces_that_are_no_triangles(tmp_path, size):
+    corners = f"{size} " + " ".join(map(str, range(size)))
+    path = tmp_path / "m.ply"
+    path.write_text(PLY.format(flags="comment", first="3 0 1 2", second=corners))
+    message = "polygon with 4" if size == 4 else "2 corners"
+    with pytest.raises(jd.InputError, match=f"face 1 is a .*{message}"):
+        jd.load_mesh(path)
+
+
+@pytest.mark.parametrize("at", [0, 700])
+def test_binary_ply_polygon(tmp_path, bar, at):
+    path = tmp_path / "m.ply"
+    jd.save_mesh(path, bar)
+    data = bytearray(path.read_bytes())
+    data[len(data) - 13 * (1440 - at)] = 4
+    path.write_bytes(data)
+    with pytest.raises(jd.InputError, match=f"face {at} is a polygon with 4"):
+        jd.load_mesh(path)
+
+
+def written(tmp_path, kind, odd) -> bytes:
+    suffix = kind.removeprefix("ascii")
+    path = tmp_path / f"whole{suffix}"
+    if suffix != kind:
+        ascii_ = igl.FileEncoding.Ascii
+        igl.write_triangle_mesh(str(path), odd.vertices, np.asarray(odd.faces), ascii_)
+    else:
+        jd.save_mesh(path, odd, **({"rigidity": 1.0} if suffix == ".ply" else {}))
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, "ascii.ply", "ascii.stl"])
+def test_a_truncated_file_is_refused_or_whole(tmp_path, odd, suffix):
+    """At every byte, but within the last number of a text: "72" may be all of it or half of 721."""
+    data = written(tmp_path, suffix, odd)
+    path = tmp_path / f"cut{suffix.removeprefix('ascii')}"
+    path.write_bytes(data)
+    whole = jd.load_mesh(path)
+    for size in range(len(data)):
+        path.write_bytes(data[:size])
+        try:
+            mesh = jd.load_mesh(path)
+        except jd.InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017 (either outcome is right)
+            continue
+        if not data[size:].strip().isdigit():
+            assert mesh.vertices.tobytes() == whole.vertices.tobytes(), size
+            np.testing.assert_array_equal(mesh.faces, whole.faces)
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, "ascii.ply", "ascii.stl"])
+def test_damaged_bytes_never_do_worse_than_an_input_error(tmp_path, odd, suffix):
+    data = np.frombuffer(written(tmp_path, suffix, odd), np.uint8)
+    path = tmp_path / f"hit{suffix.removeprefix('ascii')}"
+    rng = np.random.default_rng(5)
+    refused = 0
+    for _ in range(300):
+        hit = data.copy()
+        hit[rng.integers(len(hit), size=3)] = rng.integers(256, size=3)
+        path.write_bytes(hit.tobytes())
+        try:
+            jd.load_mesh(path)
+        except jd.InputError:
+            refused += 1
+    assert refused > 0
