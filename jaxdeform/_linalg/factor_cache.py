@@ -72,7 +72,8 @@ class Matrix(NamedTuple):
 
     def equals(self, other: "Matrix") -> bool:
         """Whether all entries are the same, bit by bit."""
-        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
+        pairs = list(zip(self, other, strict=True))
+        return all(a.shape == b.shape for a, b in pairs) and all((a == b).all() for a, b in pairs)
 
     def inner(self) -> sp.csc_matrix:
         """Return the lower triangle, with the rows and columns of fixed unknowns the identity's.

@@ -6,6 +6,7 @@ jax 0.7, 0.3 in jax 0.10).
 """
 
 import ctypes
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -99,7 +100,7 @@ class Interface:
             buffer = buffer_type.from_address(address)
             dtype, rank = self.dtypes[buffer.dtype], buffer.rank
             shape = (ctypes.c_int64 * rank).from_address(buffer.dims)[:] if rank else ()
-            size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            size = math.prod(shape) * dtype.itemsize
             memory = (ctypes.c_char * size).from_address(buffer.data) if size else b""
             return np.ndarray(shape, dtype, memoryview(memory))
 
