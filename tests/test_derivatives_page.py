@@ -52,6 +52,7 @@ def test_no_start_finds_less_than_the_corotated_minimum(cells):
         assert corotated_price(found[..., k], *data) <= best + 1e-9
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_corotated_minimum(cells):
     """First and second ones, along a line through C, B and the rigidity."""
     law = block("corotated", until="mesh =")["Corotated"]()
@@ -78,6 +79,7 @@ def test_derivatives_of_the_corotated_minimum(cells):
     np.testing.assert_allclose(curvature, difference, rtol=FD, atol=FD * scale)
 
 
+@pytest.mark.slow
 def test_the_general_rule_agrees_with_the_one_of_newton(cells):
     """Without the term of volume its material is that of Newton()."""
     names = block("volume")

@@ -13,7 +13,7 @@ import jaxdeform as jd
     ("solver", "adjoint"),
     [
         (jd.Alternating(30), jd.Unrolled()),
-        (jd.Alternating(2000), jd.Implicit()),
+        pytest.param(jd.Alternating(2000), jd.Implicit(), marks=pytest.mark.slow),
         (jd.QuasiNewton(tolerance=1e-15), jd.Implicit()),
     ],
 )

@@ -37,6 +37,7 @@ def test_two_materials_are_recovered_though_some_vertices_are_hidden(bar_problem
     assert fit.ok
 
 
+@pytest.mark.slow
 def test_the_rest_shape_tells_nothing(bar, bar_problem):
     fit = jd.estimate_rigidity(bar_problem, bar.vertices)
     assert fit.verdict == ("not determined by these poses",)

@@ -208,6 +208,7 @@ def test_slopes_of_a_batch_on_an_accelerator(bar, bar_problem, bar_targets, acce
     np.testing.assert_allclose(slope, peer_slope, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_an_accelerator_runs_without_the_host(bar, accelerator):
     """Given a start, nothing calls back; and other handles compile nothing."""
 
