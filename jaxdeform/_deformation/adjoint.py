@@ -18,7 +18,9 @@ from jaxdeform._errors import InputError
 class Unrolled:
     """Differentiate through the iterations, which are recomputed step by step (checkpointed).
 
-    Exact for the number of steps taken, converged or not. Memory grows by one mesh a step.
+    Exact for the number of steps taken, converged or not. Memory grows by one mesh a step. Second
+    derivatives are right by forward mode taken twice, wrong by forward over reverse mode
+    (docs/derivatives.md): prefer :class:`Implicit` for a Hessian.
 
     Example:
         >>> import jaxdeform as jd

@@ -74,7 +74,7 @@ def deform(
     """Deform the mesh so that its handles reach their targets and the rest follows (Eq. 4.4).
 
     A pure function of arrays: it works under jit, vmap (over targets, rigidity, start), grad, jvp
-    and hessian (to targets, rigidity and handle_weights).
+    and, with the implicit derivative, hessian (to targets, rigidity and handle_weights).
 
     **Arguments**
 
