@@ -197,8 +197,8 @@ def check_output(path: str | os.PathLike) -> None:
     """Raise InputError if the suffix is unknown or the folder cannot be written.
 
     Example:
-        >>> import jaxdeform as jd
-        >>> jd.check_output("bent.ply")
+        >>> from jaxdeform._mesh.files import check_output
+        >>> check_output("bent.ply")
     """
     path = Path(path)
     _suffix(path)
