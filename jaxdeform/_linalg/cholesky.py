@@ -159,6 +159,11 @@ def _solve_on_host(out: np.ndarray, *operands: np.ndarray) -> None:
 
 def _solve_columns(out: np.ndarray, matrix: list[np.ndarray], columns: np.ndarray) -> None:
     key, *content = matrix
+    if not (key.any() or any(x.any() for x in content)):
+        # Solvers that carry a linearised function through a loop, optimistix's among them, begin
+        # with zeros in place of all its arrays, and discard what comes out.
+        out[...] = 0
+        return
     factor = factors.get(key, Matrix(*content), columns.dtype)
     if columns.size:
         factor.solve(np.require(columns, requirements=["C", "W"]), out)

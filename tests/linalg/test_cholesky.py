@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg
@@ -413,3 +414,18 @@ def test_a_hundred_factors_made_and_dropped(right):
     for k in range(100):
         solve(made(k), right)
     assert factor_cache.factors.size < factor_cache._LEFT_OVER + (8 << 20)
+
+
+def test_optimistix_solves_through_a_factor():
+    """Its loops begin with zeros in place of the factor's arrays."""
+    n = 30
+    matrix = scipy.sparse.diags([[-1.0] * (n - 1), [2.5] * n, [-1.0] * (n - 1)], [-1, 0, 1])
+    factor = factorise(matrix.tocsr(), np.ones(n, bool), DOUBLE, positions=np.zeros((n, 3)))
+    b = jnp.arange(float(n))
+
+    def residual(theta, _):
+        return factor.solve(jnp.exp(theta) * b) - factor.solve(2.0 * b)
+
+    peer = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    found = optx.least_squares(residual, peer, jnp.asarray(0.0)).value
+    np.testing.assert_allclose(found, np.log(2.0), rtol=1e-8)
