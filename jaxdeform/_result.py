@@ -17,7 +17,7 @@ class Result(eqx.Enumeration):
     __module__ = "jaxdeform"  # where users find it, also in its repr
 
     steps_done = "Ran the number of steps that was asked for."
-    converged = "Converged: a further step would change the objective by less than the tolerance."
+    converged = "Converged: a further step would lower the energy by less than the tolerance."
     step_limit = (
         "Stopped at the step limit before the tolerance was reached: the shape is usable, but "
         "allow more steps (or loosen the tolerance) if you rely on derivatives."
