@@ -26,7 +26,6 @@ from jaxdeform._estimation.poses import (
     check_poses,
     check_start,
     deformed,
-    diagonal,
     log_bounds,
     residual_of,
     same_length,
@@ -133,7 +132,7 @@ def estimate_rigidity_field(
             progress(len(history), history[-1], np.exp(theta))
         return run
 
-    weights = diagonal(problem) ** 2 * _stages(smoothness)
+    weights = problem.mesh.diagonal**2 * _stages(smoothness)
     left = lambda: max_evaluations - len(history)  # noqa: E731
     best, result = _search_in_stages(evaluate, theta, bounds, prior, weights, left)
     misfit = poses.root_mean_square(np.asarray(best.run.residual))

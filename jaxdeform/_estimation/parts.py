@@ -21,7 +21,7 @@ from jaxdeform._estimation.bounded_gauss_newton import box_solver
 from jaxdeform._estimation.intervals import log_intervals, look_the_same, verdict
 from jaxdeform._estimation.noise import handle_modes
 from jaxdeform._estimation.part_model import Fit, PartModel
-from jaxdeform._estimation.poses import check_poses, diagonal
+from jaxdeform._estimation.poses import check_poses
 from jaxdeform._estimation.search import search
 from jaxdeform._result import Result, succeeded
 
@@ -127,7 +127,7 @@ def estimate_rigidity(
     found = _search_parts(model, model.start(start), targets is None, max_evaluations, progress)
     best = found.best
     interval = np.exp(log_intervals(model, best, found.modes))
-    same = look_the_same(model, best, displacement_tolerance * diagonal(problem))
+    same = look_the_same(model, best, displacement_tolerance * problem.mesh.diagonal)
     return Estimate(
         rigidity=np.exp(best.theta),
         interval=interval,

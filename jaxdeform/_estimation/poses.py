@@ -49,14 +49,9 @@ class PoseDerivatives(NamedTuple):
     """0 at vertices that do not count."""
 
 
-def diagonal(problem: Problem) -> float:
-    """Return the length of the bounding box diagonal of the rest shape."""
-    return problem.mesh.diagonal
-
-
 def same_length(problem: Problem) -> float:
     """Return the length below which positions are the same."""
-    return _EQUAL * diagonal(problem)
+    return _EQUAL * problem.mesh.diagonal
 
 
 def log_bounds(size: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "2 unknowns"]:
