@@ -24,9 +24,9 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The annotations of every module are checked at every call (typechecker.py).
 install_import_hook("jaxdeform", "typechecker.check")
 
-from helpers import THESIS, ends  # noqa: E402
+from helpers import THESIS, ends
 
-import jaxdeform as jd  # noqa: E402 (after x64 and the hook)
+import jaxdeform as jd
 
 
 @pytest.fixture(scope="session")

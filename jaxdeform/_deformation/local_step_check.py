@@ -20,6 +20,7 @@ _OURS = (Newton, LBFGS, GradientDescent, RotationFit, AffineFit)
 _METHODS = {
     "minimize": ("c", "b", "rigidity"),
     "with_implicit_derivative": ("t", "c", "b", "rigidity"),
+    "energy": ("t", "c", "b", "rigidity"),
 }
 
 
@@ -60,11 +61,12 @@ def check_local_step(local: object) -> None:
 @cache
 def _check_what_it_returns(local: LocalStep, dtype) -> None:
     c, b, rigidity = (jax.ShapeDtypeStruct((*axes, 5), dtype) for axes in ((3, 3), (3,), ()))
-    for method, given in zip(_METHODS, ((c, b, rigidity), (c, c, b, rigidity)), strict=True):
-        out = jax.eval_shape(getattr(local, method), *given)
-        shape, kind = getattr(out, "shape", None), getattr(out, "dtype", None)
-        if shape != c.shape or kind != dtype:
+    known = {"c": c, "t": c, "b": b, "rigidity": rigidity}
+    for method, names in _METHODS.items():
+        out = jax.eval_shape(getattr(local, method), *(known[name] for name in names))
+        wanted = (5,) if method == "energy" else c.shape
+        if getattr(out, "shape", None) != wanted or getattr(out, "dtype", None) != dtype:
             raise InputError(
                 f"{type(local).__name__}.{method} returned {out} for 5 cells of {dtype}: return "
-                f"one array of shape (3, 3, 5) and that type, the cells on the last axis"
+                f"one array of shape {wanted} and that type, the cells on the last axis"
             )

@@ -16,6 +16,7 @@ from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._mesh.bounded import bounded_cells
 from jaxdeform._mesh.cells import Cells, principal_moments, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
@@ -40,6 +41,17 @@ class System(eqx.Module):
     initial_guess: LaplacianGuess
     faces: Int[Array, "faces 3"]
 
+    def held(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+        """Return x at the vertices that are not free, 0 elsewhere.
+
+        Added to a Hessian, which is 0 there, it makes the system regular.
+        """
+        return jnp.where(self.free[None], 0.0, x)
+
+    def precondition(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+        """Return A^-1 x at free vertices, x at others."""
+        return self.factor.solve(x) + self.held(x)
+
 
 class Problem(eqx.Module):
     """A mesh with its cells and handles, factored. Made by :func:`precompute`.
@@ -54,7 +66,7 @@ class Problem(eqx.Module):
     handles: Int[np.ndarray | Array, "handles"]
     """Indices of the handle vertices, in the order of the targets' rows."""
     cells: Cells = eqx.field(static=True)
-    """The cells, as they were given (:func:`rings` with r = 1 by default)."""
+    """The cells (:func:`rings` with r = 1 by default), with the weights that are computed with."""
 
     @property
     def mesh(self) -> Mesh:
@@ -107,8 +119,9 @@ def precompute(
     **Raises** InputError: no handles; an index out of range or repeated; a connected component of
     the mesh without a handle (it could lie anywhere); cells of another mesh.
 
-    Unreferenced vertices stay where they are. Where negative cotangent weights make A indefinite,
-    they are lifted to 1e-3 of the mean weight, with a warning.
+    Unreferenced vertices stay where they are. Where negative weights leave the energy of a cell
+    without a lower bound, they count as 0, with a warning that names the cells. So the energy has a
+    lower bound for every rigidity >= 0.
 
     Example:
         >>> import jaxdeform as jd
@@ -144,7 +157,7 @@ def precompute(
         initial_guess=laplacian_guess(used, split.free & (split.soft == 0), dtype),
         faces=jax.device_put(mesh.faces.astype(np.int32)),
     )
-    return Problem(system, split.index, cells)
+    return Problem(system, split.index, used)
 
 
 def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
@@ -161,16 +174,26 @@ def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
 def _factorise(
     cells: Cells, rest: Float[np.ndarray, "vertices 3"], split: HandleSplit, dtype: np.dtype
 ) -> tuple[Cells, sp.spmatrix, Factor]:
-    """Factor A, with lifted weights if it is indefinite with those of the cells."""
-    matrix = stiffness(cells) + sp.diags(split.soft)
+    """Factor A of cells whose energy has a lower bound, and return those cells."""
+    used, bad = bounded_cells(cells)
+    if bad.size:
+        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
+        warnings.warn(
+            f"negative weights (obtuse angles) leave the energy of {len(bad)} cells without a "
+            f"lower bound (cells {shown}): {int((used.weights != cells.weights).sum())} edge "
+            "weights count as 0 there. Pass weights of your own, none negative, to decide "
+            "otherwise.",
+            stacklevel=3,
+        )
+    matrix = stiffness(used) + sp.diags(split.soft)
     try:
-        return cells, matrix, factorise(matrix, split.free, dtype, positions=rest)
+        return used, matrix, factorise(matrix, split.free, dtype, positions=rest)
     except NotPositiveDefinite:
         pass
-    lifted = lifted_weights(cells.weights)
-    raised = int((lifted > cells.weights).sum())
-    cells = dataclasses.replace(cells, weights=lifted)
-    matrix = stiffness(cells) + sp.diags(split.soft)
+    lifted = lifted_weights(used.weights)
+    raised = int((lifted > used.weights).sum())
+    used = dataclasses.replace(used, weights=lifted)
+    matrix = stiffness(used) + sp.diags(split.soft)
     try:
         factor = factorise(matrix, split.free, dtype, positions=rest)
     except NotPositiveDefinite as error:
@@ -179,12 +202,11 @@ def _factorise(
             "spans too many orders of magnitude; see jd.inspect(mesh) and jd.repair(mesh)"
         ) from error
     warnings.warn(
-        f"negative or zero weights made the system indefinite: {raised} edge weights were lifted "
-        f"to {lifted.min():.3g}. Pass weights of your own to rings() or spokes() to decide "
-        "otherwise.",
+        f"weights of 0 made the system singular: {raised} edge weights were lifted to "
+        f"{lifted.min():.3g}. Pass weights of your own to rings() or spokes() to decide otherwise.",
         stacklevel=3,
     )
-    return cells, matrix, factor
+    return used, matrix, factor
 
 
 def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:

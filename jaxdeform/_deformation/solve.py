@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._checks import (
@@ -18,13 +19,15 @@ from jaxdeform._checks import (
     read_positions,
 )
 from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.cell_energy import cell_energies
 from jaxdeform._deformation.descent import Adjoint, Solver
-from jaxdeform._deformation.energy import local_energy
+from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.local_step_check import check_local_step
 from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.verdict import inside_out, verdict
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._result import Result, succeeded
 
@@ -42,6 +45,8 @@ class Solution(eqx.Module):
     """Iterations done."""
     result: Result
     """What happened: a member of :class:`Result`."""
+    flipped: Int[Array, "*batch"]
+    """Number of cells that are inside out (det T <= 0): a part of the mesh is its mirror image."""
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:
@@ -49,14 +54,20 @@ class Solution(eqx.Module):
         return succeeded(self.result)
 
     def explain(self) -> str:
-        """Return what happened in words, with the first cells that have no finite transformation.
+        """Return what happened in words, and name the first cells that are not as they should be.
 
         Of one solution, not of a batch, and once the values are known.
         """
-        bad = np.flatnonzero(~np.isfinite(np.asarray(self.transforms)).all(axis=(1, 2)))
-        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
-        where = f" Cells at fault: {shown} ({len(bad)} of {len(self.transforms)})."
-        return Result[self.result] + (where if bad.size else "")
+        t = np.asarray(self.transforms)
+        finite = np.isfinite(t).all(axis=(1, 2))
+        orientation = np.einsum("ki,ki->k", t[:, 0], np.cross(t[:, 1], t[:, 2]))
+        flipped = finite & (orientation <= 0)
+        text = Result[self.result]
+        for what, bad in (("at fault", ~finite), ("inside out (det T <= 0)", flipped)):
+            at = np.flatnonzero(bad)
+            shown = ", ".join(map(str, at[:5])) + (", ..." if len(at) > 5 else "")
+            text += f" Cells {what}: {shown} ({len(at)} of {len(t)})." if at.size else ""
+        return text
 
 
 def deform(
@@ -70,11 +81,15 @@ def deform(
     handle_weights: ArrayLike | None = None,
     normals: bool = False,
     adjoint: Adjoint | None = None,
+    rest: ArrayLike | None = None,
+    edge_weights: ArrayLike | None = None,
+    throw: bool = False,
 ) -> Solution:
     """Deform the mesh so that its handles reach their targets and the rest follows (Eq. 4.4).
 
     A pure function of arrays: it works under jit, vmap (over targets, rigidity, start), grad, jvp
-    and, with the implicit derivative, hessian (to targets, rigidity and handle_weights).
+    and hessian (to targets, rigidity, handle_weights, and to rest and edge_weights). What has no
+    derivative, such as the arrays of the problem, raises instead of giving 0.
 
     **Arguments**
 
@@ -95,12 +110,18 @@ def deform(
     - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
       (the only one of QuasiNewton).
+    - rest: (vertices, 3), the problem's own rest positions, given to be differentiated in: the
+      derivative is that of ``precompute`` and ``deform`` together. With ``Implicit()`` only.
+    - edge_weights: (edges,), the problem's own edge weights, likewise. Without them the derivative
+      to ``rest`` includes that of the cotangent weights.
+    - throw: raise an error if the result is not ``ok``, also inside jit. By default numerical
+      trouble comes back in ``result``, because one bad member of a batch must not end the others.
 
     **Returns** a :class:`Solution`. Numerical trouble comes back in its ``result``.
 
     **Raises** InputError: targets or start of the wrong shape or not finite; rigidity negative,
     not finite or of the wrong length; settings that exclude each other. Shapes are checked always,
-    values where they are known (they are not while JAX traces).
+    values where they are known. While JAX traces they are not: then ``result`` is ``bad_input``.
 
     Example:
         >>> import jaxdeform as jd
@@ -128,8 +149,17 @@ def deform(
     if start is not None:
         start = read_positions("start", start, (count, 3), dtype)
     spread = _spread_targets(problem, targets), rigidity, _spread_weights(problem, handle_weights)
-    inputs = Inputs(*(cast(Array, x) for x in spread))  # JAX's arrays once they are inside
-    return _solve(problem.system, inputs, start, ReducedEnergy(local, normals), solver, adjoint)
+    targets, rigidity, soft = (cast(Array, x) for x in spread)  # JAX's arrays once they are inside
+    inputs = Inputs(targets, rigidity, soft)
+    if rest is not None or edge_weights is not None:
+        inputs = inputs._replace(geometry=read_geometry(problem, rest, edge_weights))
+        if not adjoint.needs_one_energy:
+            raise InputError(
+                "rest and edge_weights are differentiated by Implicit() only: give "
+                "adjoint=jd.Implicit()"
+            )
+    out = _solve(problem.system, inputs, start, ReducedEnergy(local, normals), solver, adjoint)
+    return out.result.error_if(out, ~out.ok) if throw else out
 
 
 def energy(
@@ -154,8 +184,8 @@ def energy(
     lam = jnp.asarray(check_rigidity(rigidity, count, dtype))
     t = jnp.einsum("kai,ijk->ajk", t, system.principal_axes, precision="highest")
     stiff = system.stiffness.apply(p) - system.soft[None] * p
-    cells = local_energy(t, system.covariance(p), system.principal_moments, lam)
-    return jnp.sum(p * stiff) + cells
+    cells = cell_energies(t, system.covariance(p), system.principal_moments, lam)
+    return jnp.sum(p * stiff) + jnp.sum(cells)
 
 
 def _spread_targets(
@@ -207,6 +237,7 @@ def _solve(
     solver: Solver,
     adjoint: Adjoint,
 ) -> Solution:
+    system = _without_derivative(system)
     p = _first_positions(system, inputs, start)
     end = adjoint.solve(solver, energy, system, inputs, p)
     p, steps = end.positions, end.steps
@@ -214,7 +245,6 @@ def _solve(
         energy, system, inputs, p, end.transforms, end.energy[steps]
     )
     after = jnp.arange(end.energy.shape[0], dtype=steps.dtype) >= steps
-    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(p))
     return Solution(
         vertices=(p + system.center[:, None]).T,
         transforms=jnp.einsum(
@@ -222,8 +252,25 @@ def _solve(
         ),
         energy=jnp.where(after, value, end.energy),
         steps=steps,
-        result=Result.where(finite, end.result, Result.not_finite),
+        result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
+        flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
     )
+
+
+@partial(jax.custom_jvp)
+def _without_derivative(system: System) -> System:
+    """Return the system, which refuses to be differentiated in."""
+    return system
+
+
+@partial(_without_derivative.defjvp, symbolic_zeros=True)
+def _without_derivative_jvp(primals, tangents):
+    if not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents)):
+        raise InputError(
+            "the arrays of a Problem have no derivative here: differentiate in rest= and "
+            "edge_weights= of deform, in targets, rigidity or handle_weights"
+        )
+    return primals[0], tangents[0]
 
 
 def _first_positions(system: System, inputs: Inputs, start) -> Float[Array, "3 vertices"]:

@@ -83,10 +83,9 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
 
     - mesh: the rest shape.
     - r: an integer >= 1, or one per vertex, (vertices,).
-    - weights: (edges,), one finite weight per row of ``mesh.edges``, used as given. By default,
-      cotangent weights. Negative ones (obtuse angles) are kept, except where they make the moments
-      ``B_k = sum w e e^T`` of a cell indefinite: there they are set to 0, because stretching such a
-      cell would lower its energy. Few meshes have such cells.
+    - weights: (edges,), one finite weight per row of ``mesh.edges``. By default, cotangent weights.
+      Negative ones (obtuse angles) count as 0 in the few cells whose energy they leave without a
+      lower bound; :func:`precompute` names those.
 
     **Returns** :class:`Cells`.
 
@@ -130,10 +129,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     ends.data = (ends.data == 2).astype(np.int8)
     ends.eliminate_zeros()
     ends.sort_indices()
-    chosen = _weights(mesh, weights)
-    if weights is None:
-        chosen = _bounded(mesh, ends, chosen)
-    return Cells(mesh, chosen, ends)
+    return Cells(mesh, _weights(mesh, weights), ends)
 
 
 def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
@@ -145,9 +141,8 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
     **Arguments**
 
     - mesh: the rest shape.
-    - weights: (edges,), as in :func:`rings`, but negative cotangent weights are always kept, as in
-      other ARAP programs: rotations do not need B. For a material on an obtuse mesh, use rings, or
-      pass weights that are not negative.
+    - weights: (edges,), as in :func:`rings`. A negative weight leaves nearly every star without a
+      lower bound. So, as in CGAL and unlike in libigl, negative weights count as 0 with spokes.
 
     **Returns** :class:`Cells`.
 
@@ -177,25 +172,6 @@ def principal_moments(
     # If Q were a reflection, the proper rotation of a cell would become an improper one.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return values, axes
-
-
-def indefinite_cells(cells: Cells) -> Int[np.ndarray, "bad"]:
-    """Return the cells with a clearly negative moment."""
-    moments, _ = principal_moments(cells)
-    return np.flatnonzero(moments[:, 0] < -1e-9 * np.abs(moments).max(axis=1))
-
-
-def _bounded(
-    mesh: Mesh, membership: sp.csr_matrix, weights: Float[np.ndarray, "edges"]
-) -> Float[np.ndarray, "edges"]:
-    """Set negative weights in indefinite cells to 0. Raising a weight harms no other cell."""
-    if (weights >= 0).all():
-        return weights
-    bad = indefinite_cells(Cells(mesh, weights, membership))
-    touched = np.unique(membership[bad].indices)
-    out = weights.copy()
-    out[touched] = np.maximum(out[touched], 0.0)
-    return out
 
 
 def _incidence(mesh: Mesh) -> sp.csr_matrix:
