@@ -67,11 +67,12 @@ def test_another_material_reaches_its_own_equilibrium(sheet):
 def test_both_solvers_reach_the_minimum_of_another_energy(sheet, local):
     """QuasiNewton accepts steps by the energy of the law, not by that of Eq. 4.4."""
     problem, targets = sheet
-    slow = jd.deform(problem, targets, 0.3, local=local, solver=jd.Alternating(3000))
+    slow = jd.deform(problem, targets, 0.3, local=local, solver=jd.Alternating(20_000))
     fast = jd.deform(problem, targets, 0.3, local=local, solver=jd.QuasiNewton(tolerance=1e-14))
     assert fast.result == jd.Result.converged
-    np.testing.assert_allclose(fast.energy[-1], slow.energy[-1], rtol=1e-9)
-    np.testing.assert_allclose(fast.vertices, slow.vertices, atol=1e-4)
+    size = float(slow.energy[0])  # the affine fit ends at 0
+    np.testing.assert_allclose(fast.energy[-1], slow.energy[-1], atol=1e-12 * size)
+    np.testing.assert_allclose(fast.vertices, slow.vertices, atol=1e-6)
 
 
 @pytest.mark.parametrize(
