@@ -9,20 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import (
-    as_array,
+    check_flag,
     check_positions,
     check_rigidity,
     check_targets,
-    is_concrete,
     read_positions,
 )
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.energy import local_energy
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.local_step_check import check_local_step
-from jaxdeform._deformation.problem import Problem, System
+from jaxdeform._deformation.problem import Problem, System, check_problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import ArrayLike, InputError
@@ -112,10 +112,11 @@ def deform(
         >>> out.vertices.shape
         (722, 3)
     """
+    check_problem(problem)
+    check_flag("normals", normals)
     if solver is None:
         solver = Alternating() if normals else QuasiNewton()
-    adjoint = adjoint or solver.default_adjoint
-    adjoint.check(solver)
+    adjoint = choose_adjoint(solver, adjoint)
     if normals and (solver.needs_one_energy or adjoint.needs_one_energy):
         raise InputError(
             "with normals the iteration is not the descent of one energy (n' lags behind): use "
@@ -148,6 +149,7 @@ def energy(
         >>> bool(abs(jd.energy(problem, mesh.vertices, rest, 1.0)) < 1e-2)
         True
     """
+    check_problem(problem)
     count, dtype, system = problem.n_vertices, problem.dtype, problem.system
     p = check_positions("vertices", vertices, (count, 3), dtype).T - system.center[:, None]
     t = check_positions("transforms", transforms, (count, 3, 3), dtype)
