@@ -14,6 +14,9 @@ from jaxtyping import Array, Int
 
 from jaxdeform._errors import ArrayLike, InputError, a_or_an, shown
 
+# NumPy's own limit. Lists that contain themselves have no end.
+_MOST_AXES = 64
+
 
 def is_concrete(x) -> bool:
     """Return whether the values of an array can be read now; while JAX traces they cannot."""
@@ -39,7 +42,8 @@ def read_array(value: ArrayLike, dtype: np.dtype, name: str) -> Array | np.ndarr
     leaves = _leaves(value, name)
     if hasattr(value, "__jax_array__") or any(isinstance(leaf, jax.Array) for leaf in leaves):
         for leaf in leaves:
-            _check_type(getattr(leaf, "dtype", np.dtype(type(leaf))), leaf, name)
+            if not isinstance(leaf, int | float):
+                _check_type(getattr(leaf, "dtype", np.dtype(object)), leaf, name)
         try:
             return jnp.asarray(value, dtype)
         except (TypeError, ValueError) as error:
@@ -54,6 +58,8 @@ def read_host_array(value: ArrayLike, dtype: np.dtype | type, name: str) -> np.n
 
 def read_numbers(value: ArrayLike, name: str) -> np.ndarray:
     """Return a NumPy array of booleans, integers or floats, of the type that was given."""
+    if type(value) is np.ndarray and value.dtype.kind in "biuf":
+        return value
     if isinstance(value, Tracer) or any(isinstance(x, Tracer) for x in _leaves(value, name)):
         raise InputError(
             f"{name}: traced by JAX (jit, vmap or grad), but this is worked out in NumPy, without "
@@ -86,13 +92,13 @@ def float_type(value: ArrayLike) -> np.dtype:
 
 def _leaves(value, name: str) -> list:
     """Return the entries of nested lists, unless one is masked; of anything else none."""
-    if isinstance(value, list | tuple):
-        try:
-            leaves = jax.tree.leaves(value)
-        except RecursionError as error:
-            raise _unreadable(name, "its lists are too deep: give an array of numbers") from error
+    leaves = list(value) if isinstance(value, list | tuple) else []
+    for _ in range(_MOST_AXES):
+        if not any(isinstance(x, list | tuple) for x in leaves):
+            break
+        leaves = [y for x in leaves for y in (x if isinstance(x, list | tuple) else (x,))]
     else:
-        leaves = []
+        raise _unreadable(name, "its lists are too deep: give an array of numbers")
     for part in (value, *leaves):
         if isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part):
             raise _unreadable(
@@ -105,8 +111,7 @@ def _read_numpy(value, name: str) -> np.ndarray:
     try:
         array = np.asarray(value)
     except Exception as error:  # whatever the __array__ of a foreign object raises
-        reason = " ".join(str(error).split())
-        raise _unreadable(name, f"{reason}: give an array of numbers") from error
+        raise _unreadable(name, f"{error}: give an array of numbers") from error
     _check_type(array.dtype, value, name)
     return array
 
@@ -115,32 +120,35 @@ def _check_type(dtype: Any, value, name: str) -> None:
     kind = getattr(dtype, "kind", "V")
     if kind in "biuf" or (kind == "V" and jnp.issubdtype(dtype, np.number)):  # such as bfloat16
         return
-    given = a_or_an(value) if kind == "O" else f"of type {dtype}"
+    given = f"is {a_or_an(value)}" if kind == "O" else f"is of type {dtype}"
     if kind == "O" and isinstance(value, list | tuple | np.ndarray):
-        given = "lists that hold " + _odd_entry(value)
+        given = f"holds {_odd_entry(value)}"
     move = {
         "U": "it is text: give numbers",
         "S": "it is text: give numbers",
         "M": "it holds dates: give numbers",
         "m": "it holds durations: give numbers",
         "c": "it is complex: give its real part, x.real",
-    }.get(kind, f"it is {given}: give an array of numbers")
+    }.get(kind, f"it {given}: give an array of numbers")
     raise _unreadable(name, move)
 
 
 def _odd_entry(value) -> str:
     """Describe the first entry that is no number."""
-    entries = np.asarray(value, object).ravel().tolist()
-    for entry in entries:
-        if not isinstance(entry, int | float | np.number) or abs(entry) >= 2**63:
-            return shown(entry) if isinstance(entry, int) else a_or_an(entry)
+    for entry in np.asarray(value, object).ravel().tolist():
+        if isinstance(entry, int) and abs(entry) >= 2**63:
+            return f"{shown(entry)}, which no array of whole numbers can hold"
+        if not isinstance(entry, int | float | np.number):
+            return a_or_an(entry)
     return "Python objects"
 
 
 def _unreadable(name: str, reason: str) -> InputError:
-    return InputError(f"{name} cannot be read as numbers: {reason}")
+    return InputError(f"{name} cannot be read as numbers: {' '.join(reason.split())}")
 
 
 def _cast(array: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    if array.dtype == dtype:
+        return array
     with np.errstate(over="ignore", invalid="ignore"):  # overflow gives infinity, refused later
         return array.astype(dtype, copy=False)

@@ -217,8 +217,8 @@ def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     bad = np.flatnonzero(~(given >= 0))
     if bad.size:
         raise InputError(
-            f"handle_weights: the weight of handle {index[bad[0]]} is {given[bad[0]]}: give 0 or "
-            "more, or np.inf to fix it"
+            f"the weight of handle {index[bad[0]]} is {given[bad[0]]}: give 0 or more, or np.inf "
+            "to fix it"
         )
     return given
 

@@ -17,8 +17,8 @@ from jaxdeform._errors import ArrayLike, InputError, a_or_an
 from jaxdeform._mesh.files import check_place, write_atomically
 from jaxdeform._mesh.mesh import Mesh
 
-# The drawing buffers of larger pictures end the process on some graphics systems.
-_MOST_PIXELS = 16384
+# Where the CPU draws, 40 million pixels take 3 GB; 16,384 is the width that graphics systems allow.
+_MOST_PIXELS, _MOST_WIDTH = 40e6, 16384
 
 
 def render(
@@ -42,7 +42,8 @@ def render(
     - values: for each pose an array (vertices,), a number, or None; shown as colour, on a
       logarithmic scale if all are positive and they differ by more than a factor of 5.
     - label: the name of the values.
-    - width: the width of each view, in pixels, from 16; all views together have at most 16,384.
+    - width: the width of each view, in pixels, from 16. Its height is 1.3 times that. The picture
+      may have 40 million pixels and be 16,384 wide.
 
     **Raises** InputError: the name does not end in .png; the folder cannot be written; pyvista is
     not installed; no poses, or of another shape than the mesh; values that are not finite.
@@ -60,7 +61,8 @@ def render(
     arrays = _read_poses(mesh, poses)
     colors = _read_values(mesh, values, len(arrays))
     _check_texts(titles, label, len(arrays))
-    check_count("width", width, least=16, most=_MOST_PIXELS // max(len(arrays), 1))
+    most = min((_MOST_PIXELS / 1.3 / len(arrays)) ** 0.5, _MOST_WIDTH / len(arrays))
+    check_count("width", width, least=16, most=int(most))
     check_picture_path(path)
     import pyvista  # slow to import, and needed only here
     from vtkmodules.vtkCommonCore import vtkLogger

@@ -1,6 +1,6 @@
 """What a solver and an adjoint are: the two protocols that ``deform`` is put together from."""
 
-from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int
 
@@ -70,7 +70,7 @@ class Solver(Protocol):
         ...
 
 
-def choose_adjoint(solver: Solver, adjoint: Adjoint | None) -> Adjoint:
+def choose_adjoint(solver: Any, adjoint: Any) -> Adjoint:
     """Return the adjoint, by default the solver's, or raise InputError: the two do not go together.
 
     Also if one of them is no solver, or no adjoint.

@@ -151,10 +151,10 @@ def precompute(
     return Problem(system, split.index, cells)
 
 
-def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
+def _checked_dtype(dtype: Any) -> np.dtype:
     try:
         kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
-    except TypeError:
+    except (TypeError, ValueError):
         raise InputError(f"dtype is {shown(dtype)}: use float32 or float64") from None
     if kind not in (np.float32, np.float64):
         raise InputError(f"dtype {kind} is not supported: use float32 or float64")

@@ -87,7 +87,7 @@ def residual_of(poses: Poses, vertices) -> Float[Array, "poses vertices 3"]:
 # ---------------------------------------------------------------- checks
 
 
-def check_poses(problem: Problem, observed: Any, targets: Any, mask: Any) -> Poses:
+def check_poses(problem: Any, observed: Any, targets: Any, mask: Any) -> Poses:
     """Return the poses, or raise InputError naming what is wrong."""
     check_problem(problem)
     given = read_poses("observed", observed, problem.n_vertices, problem.dtype)

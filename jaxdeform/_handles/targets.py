@@ -165,7 +165,7 @@ def _points(xp, points: ArrayLike) -> Points:
 def _numbers(xp, name: str, value: ArrayLike, dtype, *shapes: tuple[int, ...]):
     array = (read_array if xp is jnp else read_host_array)(value, dtype, name)
     if array.shape not in shapes:
-        allowed = " or ".join(map(str, shapes))
+        allowed = " or ".join(str(shape) if shape else "one number" for shape in shapes)
         raise InputError(f"{name} has shape {array.shape}: give {allowed}")
     if not isinstance(array, Tracer) and not np.isfinite(np.asarray(array)).all():
         raise InputError(f"{name} is {shown(np.asarray(array))}: give finite numbers")

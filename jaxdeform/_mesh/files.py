@@ -37,7 +37,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
         >>> jd.load_mesh(path)
         Mesh(722 vertices, 1440 faces)
     """
-    vertices, faces = read_arrays(path)
+    vertices, faces = read_arrays(read_path("path", path))
     try:
         return Mesh(vertices, faces)
     except InputError as error:
@@ -140,7 +140,7 @@ def read_arrays(
     **Raises** InputError: the file is missing, empty, truncated or unreadable, its suffix is
     unknown, or it holds polygons.
     """
-    path = read_path("path", path)
+    path = Path(path)
     suffix = _suffix(path)
     vertices, faces = FORMATS[suffix].parse(path, _read_bytes(path))
     if not len(faces):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from jaxdeform._checks import read_path
 from jaxdeform._errors import ArrayLike, InputError, a_or_an
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
@@ -26,7 +27,7 @@ def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike]:
     if isinstance(mesh, Mesh):
         return mesh.vertices, mesh.faces
     if isinstance(mesh, str | os.PathLike):
-        return read_arrays(mesh)
+        return read_arrays(read_path("mesh", mesh))
     if not isinstance(mesh, list | tuple) or len(mesh) != 2:
         raise InputError(
             f"mesh is {a_or_an(mesh)}: give a Mesh, a pair (vertices, faces), or the path of a file"

@@ -153,7 +153,15 @@ def test_command_refuses_what_does_not_fit(monkeypatch, tmp_path, capsys, bar):
     jd.save_mesh(rest, bar)
     jd.save_mesh(other, jd.Mesh(bar.vertices, bar.faces[::-1]))
     (tmp_path / "short.txt").write_text("0 1 0")
-    (tmp_path / "words.json").write_text('["soft"]')
+    for name, text in {
+        "words.json": '["soft"]',
+        "halves.json": "[0.5, 1.7" + ", 0" * 720 + "]",
+        "huge.json": "[1000000000" + ", 0" * 721 + "]",
+        "deep.json": "[" * 100_000,
+        "keys.json": '{"0": 1}',
+        "marks.txt": "1_0" + " 0" * 721,
+    }.items():
+        (tmp_path / name).write_text(text)
     out.write_text("kept")
     for arguments, message in (
         ([rest, other, "-o", out], "other.ply: is not a pose of"),
