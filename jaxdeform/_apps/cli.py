@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -21,6 +22,7 @@ from rich.table import Table
 
 import jaxdeform as jd
 from jaxdeform._checks import check_rigidity
+from jaxdeform._errors import shown
 from jaxdeform._estimation.parts import check_parts
 from jaxdeform._mesh.files import check_output, check_place, write_atomically
 from jaxdeform._plotting import check_picture_path
@@ -289,17 +291,17 @@ def _pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:
 
 def _parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
     try:
-        text = path.read_text(encoding="utf-8")
-        values = json.loads(text) if path.suffix.lower() == ".json" else text.split()
-        label = np.array([int(value) for value in values])
-    except (OSError, ValueError, TypeError) as error:
-        raise jd.InputError(
-            f"{path}: cannot be read as one integer per vertex ({error}): give a number per line"
-        ) from error
-    try:
-        return check_parts(label, mesh.n_vertices)
+        text = path.read_text(encoding="utf-8-sig")
+        strange = re.search(r"\S*[^\s\d+-]\S*", text, re.ASCII)  # int() would take 1_0 for 10
+        is_json = path.suffix.lower() == ".json"
+        if strange and not is_json:
+            raise ValueError(f"{shown(strange[0])} is no whole number")
+        values = json.loads(text) if is_json else [int(word) for word in text.split()]
+        return check_parts(values, mesh.n_vertices)
     except jd.InputError as error:
         raise jd.InputError(f"{path}: {error}") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise jd.InputError(f"{path}: {error}: give one integer per vertex and line") from error
 
 
 def _as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:

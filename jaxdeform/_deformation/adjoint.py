@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdeform._checks import check_count, check_tolerance
+from jaxdeform._checks import check_count, check_flag, check_tolerance
 from jaxdeform._deformation.descent import Descent, Solver
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
@@ -84,6 +84,7 @@ class Implicit:
         """Check the settings."""
         check_tolerance("tolerance of Implicit", self.tolerance)
         check_count("max_steps of Implicit", self.max_steps)
+        check_flag("throw of Implicit", self.throw)
 
     def check(self, solver: Solver) -> None:
         """Accept every solver."""

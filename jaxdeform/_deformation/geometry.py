@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._checks import as_array, is_concrete
+from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
+from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.cell_energy import cell_energies, cell_energy
 from jaxdeform._deformation.cell_newton import block_newton, exact_newton, gradient_tolerance
 from jaxdeform._deformation.material_derivative import material_with_derivative
@@ -106,6 +107,12 @@ def _over_batch(local: LocalStep):
 class _Material:
     """Solvers of Eq. 4.2 share the derivative of its solution."""
 
+    max_steps: int
+
+    def __post_init__(self) -> None:
+        """Check the setting."""
+        check_count(f"max_steps of {type(self).__name__}", self.max_steps)
+
     def with_implicit_derivative(
         self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
     ) -> Matrices:
@@ -157,6 +164,11 @@ class LBFGS(_Material):
     tolerance: float = 1e-10
     """Stop at this gradient norm, relative to the cell's size (no less than 16 eps)."""
     max_steps: int = 200
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        check_tolerance("tolerance of LBFGS", self.tolerance)
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
         """Return the minimisers T (3, 3, n)."""

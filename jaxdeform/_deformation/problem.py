@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,16 +11,20 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._checks import HandleSplit, check_rigidity, split_handles
+from jaxdeform._checks import check_precision, check_rigidity, check_type
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_map, stiffness
 from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, shown
+from jaxdeform._handles.split import HandleSplit, split_handles
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.bounded import bounded_cells
 from jaxdeform._mesh.cells import Cells, principal_moments, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
+
+# Further from the origin, in diagonals, float32 keeps fewer than four digits of a position.
+_FAR_IN_FLOAT32 = 1e3
 
 
 class System(eqx.Module):
@@ -131,16 +136,25 @@ def precompute(
         >>> jd.precompute(mesh, handles).n_vertices
         722
     """
+    check_type("mesh", mesh, Mesh)
     split = split_handles(mesh, handles, handle_weights)
     cells = rings(mesh, 1) if cells is None else cells
+    check_type("cells", cells, Cells)
     if cells.mesh != mesh:
         raise InputError(
             f"cells are of another mesh ({cells.mesh}, not equal to this {mesh}): call "
             "rings(mesh, r) on this mesh"
         )
     dtype = _checked_dtype(dtype)
-    center = mesh.vertices[mesh.referenced].mean(axis=0)
+    center = mesh.center
     rest = mesh.vertices - center
+    if dtype == np.float32 and np.abs(center).max() > _FAR_IN_FLOAT32 * mesh.diagonal:
+        warnings.warn(
+            f"the mesh lies {np.abs(center).max() / mesh.diagonal:.0f} diagonals from the origin: "
+            "it is deformed about its own centre, but the positions that come back are rounded to "
+            "float32. Move it to the origin, or use float64.",
+            stacklevel=2,
+        )
     used, matrix, factor = _factorise(cells, rest, split, dtype)
     moments, axes = principal_moments(used)
     put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
@@ -160,8 +174,11 @@ def precompute(
     return Problem(system, split.index, used)
 
 
-def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
-    kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
+def _checked_dtype(dtype: Any) -> np.dtype:
+    try:
+        kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise InputError(f"dtype is {shown(dtype)}: use float32 or float64") from None
     if kind not in (np.float32, np.float64):
         raise InputError(f"dtype {kind} is not supported: use float32 or float64")
     if kind == np.float64 and not jax.config.read("jax_enable_x64"):
@@ -209,6 +226,12 @@ def _factorise(
     return used, matrix, factor
 
 
+def check_problem(problem: Any) -> None:
+    """Raise InputError unless this is a problem, of a type that JAX can compute in now."""
+    check_type("problem", problem, Problem)
+    check_precision("problem", problem.dtype)
+
+
 def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:
     """Turn a scale-free, resolution-free material constant into the rigidity of each vertex.
 
@@ -226,6 +249,7 @@ def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array
         >>> jd.rigidity_from_material(problem, 0.2).shape
         (722,)
     """
+    check_problem(problem)
     constant = check_rigidity(constant, problem.n_vertices, problem.dtype, name="constant")
     trace = jnp.sum(problem.system.principal_moments, axis=0)
     return jnp.asarray(constant) * jnp.maximum(trace, 0.0) / 2.0

@@ -10,21 +10,21 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import (
-    as_array,
+    check_flag,
     check_positions,
     check_rigidity,
-    check_targets,
-    is_concrete,
+    read_host_positions,
     read_positions,
 )
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.cell_energy import cell_energies
-from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.local_step_check import check_local_step
-from jaxdeform._deformation.problem import Problem, System
+from jaxdeform._deformation.problem import Problem, System, check_problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.verdict import inside_out, verdict
@@ -133,10 +133,12 @@ def deform(
         >>> out.vertices.shape
         (722, 3)
     """
+    check_problem(problem)
+    check_flag("normals", normals)
+    check_flag("throw", throw)
     if solver is None:
         solver = Alternating() if normals else QuasiNewton()
-    adjoint = adjoint or solver.default_adjoint
-    adjoint.check(solver)
+    adjoint = choose_adjoint(solver, adjoint)
     if normals and (solver.needs_one_energy or adjoint.needs_one_energy):
         raise InputError(
             "with normals the iteration is not the descent of one energy (n' lags behind): use "
@@ -144,13 +146,14 @@ def deform(
         )
     check_local_step(local)
     count, dtype = problem.n_vertices, problem.dtype
-    targets = check_targets(targets, len(problem.handles), dtype)
     rigidity = check_rigidity(rigidity, count, dtype)
+    relative = _from_center(problem, "targets", targets, len(problem.handles), "handle")
     if start is not None:
-        start = read_positions("start", start, (count, 3), dtype)
-    spread = _spread_targets(problem, targets), rigidity, _spread_weights(problem, handle_weights)
-    targets, rigidity, soft = (cast(Array, x) for x in spread)  # JAX's arrays once they are inside
-    inputs = Inputs(targets, rigidity, soft)
+        start = _from_center(problem, "start", start, count, "vertex")
+    spread = _spread_targets(problem, relative)
+    soft = _spread_weights(problem, handle_weights)
+    # NumPy's arrays are JAX's once they are inside.
+    inputs = Inputs(cast(Array, spread), cast(Array, rigidity), soft)
     if rest is not None or edge_weights is not None:
         inputs = inputs._replace(geometry=read_geometry(problem, rest, edge_weights))
         if not adjoint.needs_one_energy:
@@ -178,6 +181,7 @@ def energy(
         >>> bool(abs(jd.energy(problem, mesh.vertices, rest, 1.0)) < 1e-2)
         True
     """
+    check_problem(problem)
     count, dtype, system = problem.n_vertices, problem.dtype, problem.system
     p = check_positions("vertices", vertices, (count, 3), dtype).T - system.center[:, None]
     t = check_positions("transforms", transforms, (count, 3, 3), dtype)
@@ -188,8 +192,28 @@ def energy(
     return jnp.sum(p * stiff) + jnp.sum(cells)
 
 
+def _from_center(
+    problem: Problem, name: str, value: ArrayLike, rows: int, unit: str
+) -> Float[Array, "3 rows"] | Float[np.ndarray, "3 rows"]:
+    """Read positions (rows, 3) relative to the centre of the rest shape.
+
+    Known values are subtracted in float64, so that a float32 problem far from the origin loses no
+    digit of where its handles go.
+    """
+    if isinstance(value, Array) and not is_concrete(value):
+        given = read_positions(name, value, (rows, 3), problem.dtype, unit)
+        return jnp.asarray(given - problem.system.center[None]).T
+    given = read_host_positions(name, value, (rows, 3), unit) - problem.mesh.center
+    with np.errstate(over="ignore"):
+        given = given.T.astype(problem.dtype)
+    if not np.isfinite(given).all():
+        raise InputError(f"{name} are too large for {problem.dtype}: use another unit of length")
+    return given
+
+
 def _spread_targets(
-    problem: Problem, targets: Array | np.ndarray
+    problem: Problem,
+    targets: Float[Array, "3 handles"] | Float[np.ndarray, "3 handles"],
 ) -> Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"]:
     """Spread the targets over an array of all vertices, in NumPy where they are known.
 
@@ -197,11 +221,11 @@ def _spread_targets(
     not compile anything anew.
     """
     system, handles = problem.system, problem.handles
-    if all(map(is_concrete, (targets, system.center, system.rest, handles))):
+    if all(map(is_concrete, (targets, system.rest, handles))):
         spread = np.array(system.rest)
-        spread[:, np.asarray(handles)] = (np.asarray(targets) - np.asarray(system.center)).T
+        spread[:, np.asarray(handles)] = targets
         return spread
-    return system.rest.at[:, handles].set((targets - system.center[None]).T)
+    return system.rest.at[:, handles].set(targets)
 
 
 def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "vertices"]:
@@ -232,7 +256,7 @@ def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array,
 def _solve(
     system: System,
     inputs: Inputs,
-    start: Float[Array, "vertices 3"] | Float[np.ndarray, "vertices 3"] | None,
+    start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
     energy: ReducedEnergy,
     solver: Solver,
     adjoint: Adjoint,
@@ -280,7 +304,7 @@ def _first_positions(system: System, inputs: Inputs, start) -> Float[Array, "3 v
         displacement = jnp.where(led[None], inputs.targets - system.rest, 0.0)
         p = system.rest + system.initial_guess(displacement)
     else:
-        p = start.T - system.center[:, None]
+        p = start
     return jnp.where(system.free[None], p, inputs.targets)
 
 

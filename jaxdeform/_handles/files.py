@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxdeform._checks import check_handles
-from jaxdeform._errors import InputError
+from jaxdeform._checks import check_handles, check_type, read_path
+from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.mesh import Mesh
 
 
@@ -55,10 +55,12 @@ def load_handles(
         >>> jd.load_handles(path, jd.shapes.bar()).handles
         array([0, 1])
     """
-    path = Path(path)
+    path = read_path("path", path)
+    check_type("mesh", mesh, Mesh)
+    motion = None if motion is None else read_path("motion", motion)
     suffix = path.suffix.lower()
     if suffix == ".sel":
-        beside = path.with_suffix(".def") if motion is None else Path(motion)
+        beside = path.with_suffix(".def") if motion is None else motion
         handles, targets = _parse_survey(path, beside, mesh)
     elif suffix != ".json":
         raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
@@ -98,7 +100,7 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         _check_keys(where, group, "vertices", "rotation", "translation", "targets", "name")
         try:
             index = check_handles(group["vertices"], mesh.n_vertices)
-        except (InputError, ValueError) as error:
+        except InputError as error:
             raise InputError(f"{where}: {error}") from error
         handles.append(index)
         targets.append(_moved(where, group, mesh.vertices[index]))
@@ -149,18 +151,18 @@ def _numbers(where: str, name: str, value, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    status = np.array([word for row in _words(path) for word in row])
-    if len(status) != mesh.n_vertices:
+    words = [word for row in _words(path) for word in row]
+    if len(words) != mesh.n_vertices:
         raise InputError(
-            f"{path}: has {len(status)} numbers, but the mesh has {mesh.n_vertices} vertices: give "
+            f"{path}: has {len(words)} numbers, but the mesh has {mesh.n_vertices} vertices: give "
             "the file of this mesh"
         )
-    strange = np.flatnonzero(~np.isin(status, ["0", "1", "2"]))
-    if strange.size:
-        raise InputError(
-            f"{path}: vertex {strange[0]} is '{status[strange[0]]}': give 0 (fixed), 1 (free) or 2 "
-            "(handle)"
-        )
+    for vertex, word in enumerate(words):  # before an array, where all take the longest's room
+        if word not in ("0", "1", "2"):
+            raise InputError(
+                f"{path}: vertex {vertex} is {shown(word)}: give 0 (fixed), 1 (free) or 2 (handle)"
+            )
+    status = np.array(words)
     matrix = _numbers(str(motion), "the matrix", _words(motion), (4, 4))
     if matrix[3].tolist() != [0, 0, 0, 1]:
         raise InputError(

@@ -7,6 +7,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_host_array, read_integers
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh, content_digest
@@ -97,10 +99,9 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
         >>> jd.rings(jd.shapes.bar(), 2)
         Cells(722 cells, 2160 edges, 41.8 edges per cell)
     """
+    check_type("mesh", mesh, Mesh)
     n = mesh.n_vertices
-    radius = np.asarray(r)
-    if radius.dtype.kind not in "iu":
-        raise InputError(f"r must be an integer, or one per vertex, got {radius.dtype}: try 1")
+    radius = read_integers(r, "r", "give one integer, or one per vertex, such as 1")
     if radius.ndim > 0 and radius.shape != (n,):
         raise InputError(
             f"r has shape {radius.shape}, but the mesh has {n} vertices: give one integer or ({n},)"
@@ -153,6 +154,7 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
         >>> jd.spokes(jd.shapes.bar())
         Cells(722 cells, 2160 edges, 6.0 edges per cell)
     """
+    check_type("mesh", mesh, Mesh)
     return Cells(mesh, _weights(mesh, weights), _incidence(mesh))
 
 
@@ -189,7 +191,7 @@ def _incidence(mesh: Mesh) -> sp.csr_matrix:
 def _weights(mesh: Mesh, weights: ArrayLike | None) -> Float[np.ndarray, "edges"]:
     if weights is None:
         return cotangent_weights(mesh)
-    given = np.asarray(weights, dtype=np.float64)
+    given = read_host_array(weights, np.float64, "weights")
     if given.shape != (len(mesh.edges),):
         raise InputError(
             f"weights have shape {given.shape}: give one per row of mesh.edges, "

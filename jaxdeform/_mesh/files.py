@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_host_array
+from jaxdeform._checks import check_rigidity, check_type, read_path
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.formats import FORMATS, ply_columns, to_ply
 from jaxdeform._mesh.mesh import Mesh, merge_equal_points
@@ -35,7 +37,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
         >>> jd.load_mesh(path)
         Mesh(722 vertices, 1440 faces)
     """
-    vertices, faces = read_arrays(path)
+    vertices, faces = read_arrays(read_path("path", path))
     try:
         return Mesh(vertices, faces)
     except InputError as error:
@@ -71,9 +73,11 @@ def save_mesh(
         >>> jd.load_rigidity(path)[:2]
         array([0.5, 0.5])
     """
-    path = Path(path)
+    path = read_path("path", path)
     suffix = _suffix(path)
-    points = np.asarray(mesh.vertices if vertices is None else vertices, np.float64)
+    check_type("mesh", mesh, Mesh)
+    points = mesh.vertices if vertices is None else vertices
+    points = read_host_array(points, np.float64, "vertices")
     if points.shape != mesh.vertices.shape:
         raise InputError(
             f"vertices have shape {points.shape}, but the mesh has {mesh.vertices.shape}: a pose "
@@ -88,11 +92,8 @@ def save_mesh(
     if rigidity is not None:
         if suffix != ".ply":
             raise InputError(f"{path}: only PLY carries rigidity per vertex: use a .ply name")
-        rigidity = np.asarray(rigidity, np.float64)
-        if rigidity.shape not in ((), (mesh.n_vertices,)):
-            raise InputError(
-                f"rigidity has shape {rigidity.shape}: give one number or ({mesh.n_vertices},)"
-            )
+        rigidity = read_host_array(rigidity, np.float64, "rigidity")
+        rigidity = np.asarray(check_rigidity(rigidity, mesh.n_vertices, rigidity.dtype))
         content = to_ply(points, mesh.faces, rigidity)
     else:
         content = FORMATS[suffix].to_bytes(points, mesh.faces)
@@ -116,7 +117,7 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
         >>> jd.load_rigidity(path).shape
         (722,)
     """
-    path = Path(path)
+    path = read_path("path", path)
     if _suffix(path) != ".ply":
         raise InputError(f"{path}: rigidity is kept in .ply files only")
     columns, _ = ply_columns(path, _read_bytes(path))

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._checks import check_type
 from jaxdeform._mesh.mesh import Mesh
 
 
@@ -33,6 +34,7 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
         >>> jd.cotangent_weights(jd.shapes.bar()).shape
         (2160,)
     """
+    check_type("mesh", mesh, Mesh)
     # Scale first, because libigl squares areas: a mesh 1e-90 wide would underflow.
     vertices = mesh.vertices - mesh.vertices.mean(axis=0)
     vertices = vertices / np.abs(vertices).max()

@@ -135,8 +135,8 @@ class Forgetful(Corotated):
 WRONG = {
     "text 'arap': give a local step, such as .*RotationFit": "arap",
     r"class RotationFit: give RotationFit\(\) instead": jd.RotationFit,
-    "type NoneType, without the method minimize": None,
-    r"type NoDerivative, without the method with_implicit_derivative\(t, c, b": NoDerivative(),
+    "local is None, without minimize: give a local step": None,
+    "local is a NoDerivative, without with_implicit_derivative": NoDerivative(),
     r"OldProtocol.minimize cannot be called with \(c, b, rigidity\)": OldProtocol(),
     "Unhashable is not hashable.*frozen": Unhashable(),
     r"CellsFirst.minimize returned .*\(3, 3, 5\)": CellsFirst(),
