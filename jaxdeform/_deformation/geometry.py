@@ -59,7 +59,7 @@ def read_geometry(
             raise InputError(f"{name} have shape {given.shape}, expected {known.shape}")
         if is_concrete(given):
             size = max(np.abs(known).max(), 1e-300)
-            far = np.abs(np.asarray(given) - known) > 1e3 * np.finfo(dtype).eps * size
+            far = ~(np.abs(np.asarray(given) - known) <= 1e3 * np.finfo(dtype).eps * size)
             if far.any():
                 raise InputError(
                     f"{name} of {unit} {np.argwhere(far)[0][0]} are not the problem's own: they "

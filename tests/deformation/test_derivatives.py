@@ -71,6 +71,7 @@ def _held_loss(local, solver):
 
 
 LAWS = {"material": jd.Newton(), "rotation": jd.RotationFit(), "affine": jd.AffineFit()}
+PATHS = ["implicit", "unrolled"]
 AT = jnp.asarray([0.2, -0.5])
 
 
@@ -127,7 +128,7 @@ def test_an_unsolved_linear_system_gives_nan_or_raises(bar_problem, bar_targets)
     def slope(adjoint):
         loss = lambda r: jnp.sum(
             jd.deform(bar_problem, bar_targets, r, adjoint=adjoint).vertices ** 2
-        )  # noqa: E731
+        )
         return jax.grad(loss)(0.3)
 
     assert np.isnan(slope(jd.Implicit(max_steps=1)))
