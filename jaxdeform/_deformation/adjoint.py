@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdeform._checks import check_count, check_flag, check_tolerance
-from jaxdeform._deformation.descent import Descent, Solver
+from jaxdeform._deformation.descent import Anchor, Descent, Solver
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import InputError
@@ -45,9 +45,10 @@ class Unrolled:
         system: System,
         inputs: Inputs,
         start: Float[Array, "3 vertices"],
-    ) -> Descent:
+    ) -> tuple[Descent, Anchor]:
         """Run the solver; JAX differentiates its loop."""
-        return solver.minimize(energy, system, inputs, start)
+        end = solver.minimize(energy, system, inputs, start)
+        return end, Anchor(end.positions, end.transforms)
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,9 @@ class Implicit:
     The Hessian H = A - K^T dT/dC K is symmetric, so one conjugate gradient method, preconditioned
     with the factor of A, serves forward and reverse mode.
 
-    Before that one Newton step moves the state to its minimum, because the error of a derivative is
-    that of the state many times over: with the state of ``QuasiNewton()`` alone up to 2.6 % on the
-    bent bar, with the step below 1e-4 (docs/derivatives.md has the table).
+    It is taken one Newton step further than the state, at the minimum, because the error of a
+    derivative is that of the state many times over: at the state of ``QuasiNewton()`` itself up to
+    2.6 % on the bent bar, after the step below 1e-4 (docs/derivatives.md has the table).
 
     Where the linear system is not solved, the derivative is NaN, not a wrong number: the state is
     at a saddle or far from converged, or ``max_steps`` is too low.
@@ -96,20 +97,19 @@ class Implicit:
         system: System,
         inputs: Inputs,
         start: Float[Array, "3 vertices"],
-    ) -> Descent:
+    ) -> tuple[Descent, Anchor]:
         """Run the solver on constants, and give its end the derivative of the fixed point."""
         known = inputs._replace(geometry=None)
         end = solver.minimize(energy, *jax.lax.stop_gradient((system, known, start)))
         end = jax.lax.stop_gradient(end)
-        p, transforms = self._with_implicit_derivative(
-            energy, system, inputs, end.positions, end.transforms
-        )
-        return end._replace(positions=p, transforms=transforms)
+        state = end.positions, end.transforms
+        p, anchor = self._with_implicit_derivative(energy, system, inputs, *state)
+        return end._replace(positions=p), anchor
 
     def _with_implicit_derivative(self, energy: ReducedEnergy, system, inputs, p, transforms):
-        """Return p, known to be the minimiser for these inputs, with the derivatives of that.
+        """Return p, known to be near the minimiser for these inputs, with the derivatives of that.
 
-        And the transformations, moved with it where a derivative moves p; they have no derivative.
+        And where they were taken: at p moved by a Newton step, if any derivative is asked for.
 
         (lax.custom_root would do it too, but it traces the derivatives even where nobody asks for
         any: 0.7 s.)
@@ -118,13 +118,13 @@ class Implicit:
         @jax.custom_jvp
         def minimiser(system, inputs, p, transforms):
             del system, inputs
-            return p, transforms
+            return p, Anchor(p, transforms)
 
         @minimiser.defjvp
         def minimiser_jvp(primals, tangents):
             system, inputs, *state = primals
-            p, transforms = self._newton_step(energy, system, inputs, *state)
             known, _ = minimiser(*primals)  # so that this rule has derivatives too
+            p, transforms = self._newton_step(energy, system, inputs, *state)
             p = p + known - jax.lax.stop_gradient(known)
 
             def gradient(free, inputs):
@@ -135,7 +135,8 @@ class Implicit:
             _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
             move = self._solve_hessian(system, hessian, -right)
             move = jnp.where(system.free[None], move, tangents[1].targets)
-            return (p, transforms), (move, jnp.zeros_like(transforms))
+            moves = move, Anchor(move, jnp.zeros_like(transforms))
+            return (known, Anchor(p, transforms)), moves
 
         return minimiser(system, inputs, p, transforms)
 

@@ -24,6 +24,15 @@ class Descent(NamedTuple):
     result: Result
 
 
+class Anchor(NamedTuple):
+    """Where derivatives are taken: at the end of the descent, or at the minimum next to it."""
+
+    positions: Float[Array, "3 vertices"]
+    """With the derivatives of the end."""
+    transforms: Float[Array, "3 3 vertices"]
+    """At these positions, as numbers without derivatives."""
+
+
 @runtime_checkable
 class Adjoint(Protocol):
     """How derivatives are made: what ``deform(..., adjoint=)`` takes."""
@@ -42,8 +51,8 @@ class Adjoint(Protocol):
         system: System,
         inputs: Inputs,
         start: Float[Array, "3 vertices"],
-    ) -> Descent:
-        """Run the solver, so that what comes back has derivatives to the inputs."""
+    ) -> tuple[Descent, Anchor]:
+        """Run the solver, so that its positions and the anchor's have derivatives to the inputs."""
         ...
 
 

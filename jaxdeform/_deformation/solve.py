@@ -20,7 +20,7 @@ from jaxdeform._checks import (
 )
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.cell_energy import cell_energies
-from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
+from jaxdeform._deformation.descent import Adjoint, Anchor, Solver, choose_adjoint
 from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.local_step_check import check_local_step
@@ -263,10 +263,10 @@ def _solve(
 ) -> Solution:
     system = _without_derivative(system)
     p = _first_positions(system, inputs, start)
-    end = adjoint.solve(solver, energy, system, inputs, p)
+    end, anchor = adjoint.solve(solver, energy, system, inputs, p)
     p, steps = end.positions, end.steps
     transforms, value = _with_derivatives_at_end(
-        energy, system, inputs, p, end.transforms, end.energy[steps]
+        energy, system, inputs, anchor, end.transforms, end.energy[steps]
     )
     after = jnp.arange(end.energy.shape[0], dtype=steps.dtype) >= steps
     return Solution(
@@ -308,26 +308,29 @@ def _first_positions(system: System, inputs: Inputs, start) -> Float[Array, "3 v
     return jnp.where(system.free[None], p, inputs.targets)
 
 
-def _with_derivatives_at_end(energy: ReducedEnergy, system, inputs, p, transforms, value):
-    """Return the transformations and the energy at p with their derivatives.
+def _with_derivatives_at_end(
+    energy: ReducedEnergy, system: System, inputs: Inputs, anchor: Anchor, transforms, value
+):
+    """Return the transformations and the energy of the end with the derivatives at the anchor.
 
     Both are known, so nothing is evaluated (nor compiled) unless derivatives are asked for.
     """
 
     @jax.custom_jvp
-    def at_end(system, inputs, p, transforms, value):
-        del system, inputs, p
+    def at_end(system, inputs, anchor, transforms, value):
+        del system, inputs, anchor
         return transforms, value
 
     @at_end.defjvp
     def at_end_jvp(primals, tangents):
-        system, inputs, p, transforms, _ = primals
+        system, inputs, anchor, *_ = primals
 
         def run(inputs, p):
-            at = energy.evaluate(system, inputs, p, transforms)
+            at = energy.evaluate(system, inputs, p, anchor.transforms)
             return at.transforms, at.energy
 
         known = at_end(*primals)  # so that this rule has derivatives too
-        return known, jax.jvp(run, (inputs, p), tuple(tangents[1:3]))[1]
+        moved = tangents[1], tangents[2].positions
+        return known, jax.jvp(run, (inputs, anchor.positions), moved)[1]
 
-    return at_end(system, inputs, p, transforms, value)
+    return at_end(system, inputs, anchor, transforms, value)
