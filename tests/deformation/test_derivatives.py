@@ -126,9 +126,10 @@ def test_a_gradient_is_right_at_the_default_tolerance(bar, bar_problem, bar_targ
 
 def test_an_unsolved_linear_system_gives_nan_or_raises(bar_problem, bar_targets):
     def slope(adjoint):
-        loss = lambda r: jnp.sum(
-            jd.deform(bar_problem, bar_targets, r, adjoint=adjoint).vertices ** 2
-        )
+        def loss(r):
+            out = jd.deform(bar_problem, bar_targets, r, adjoint=adjoint)
+            return jnp.sum(out.vertices**2)
+
         return jax.grad(loss)(0.3)
 
     assert np.isnan(slope(jd.Implicit(max_steps=1)))
