@@ -9,6 +9,28 @@ else:
     # checks, which say what is wrong with it.
     ArrayLike = Any
 
+_LONGEST = 1000
+
 
 class InputError(ValueError):
-    """Wrong input: names the vertex, face, file or argument, the reason, and the next move."""
+    """Wrong input: names the vertex, face, file or argument, the reason, and the next move.
+
+    The text is one line of bounded length. Control characters, which may come from a file, are
+    shown as escapes, so that they never reach a terminal.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        """Keep the text, made safe to print."""
+        super().__init__(printable(text, _LONGEST))
+
+
+def printable(text: str, longest: int | None = None) -> str:
+    r"""Return the text with escapes for what no terminal should get, such as ``\x1b``.
+
+    A longer text than ``longest`` loses its middle.
+    """
+    if longest is not None and len(text) > longest:
+        text = f"{text[: longest - 300]} ... {text[-295:]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

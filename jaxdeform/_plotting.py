@@ -2,8 +2,8 @@
 
 import os
 from collections.abc import Sequence
-from functools import partial
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._mesh.files import check_place, write_atomically
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.writing import check_place, write_atomically
 
 
 def render(
@@ -80,7 +80,7 @@ def render(
     plotter.reset_camera(bounds=_bounds(together))  # pyright: ignore[reportCallIssue]
     image = np.asarray(plotter.screenshot(return_img=True))
     plotter.close()
-    write_atomically(path, partial(_write_png, image))
+    write_atomically(path, _png(image))
 
 
 def _color_scale(shown: Sequence[ArrayLike], label: str) -> dict[str, Any]:
@@ -94,10 +94,12 @@ def _color_scale(shown: Sequence[ArrayLike], label: str) -> dict[str, Any]:
     }
 
 
-def _write_png(image: np.ndarray, name: str) -> None:
+def _png(image: np.ndarray) -> bytes:
     from PIL import Image  # comes with pyvista
 
-    Image.fromarray(image).save(name, format="PNG")
+    content = BytesIO()
+    Image.fromarray(image).save(content, format="PNG")
+    return content.getvalue()
 
 
 def check_picture_path(path: Path) -> None:

@@ -22,7 +22,8 @@ from rich.table import Table
 import jaxdeform as jd
 from jaxdeform._checks import check_rigidity
 from jaxdeform._estimation.parts import check_parts
-from jaxdeform._mesh.files import check_output, check_place, write_atomically
+from jaxdeform._mesh.files import check_output
+from jaxdeform._mesh.writing import check_place, write_atomically
 from jaxdeform._plotting import check_picture_path
 
 app = typer.Typer(
@@ -252,7 +253,7 @@ def estimate(
     console.print(jd.Result[fit.result])
     jd.save_mesh(out, shape, rigidity=fit.field)
     text = json.dumps(_as_json(fit, index), indent=1, allow_nan=False)
-    write_atomically(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
+    write_atomically(report, f"{text}\n".encode())
     console.print(f"wrote {out} and {report}")
 
 

@@ -17,21 +17,22 @@ from jaxdeform._mesh.mesh import (
     merge_equal_points,
     unique_edges,
 )
+from jaxdeform._mesh.parsed import Source
 
 # A broken mesh cannot become a Mesh, so the functions below take it in any of three forms.
 MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike
 
 
-def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike]:
+def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike, Source | None]:
     if isinstance(mesh, Mesh):
-        return mesh.vertices, mesh.faces
+        return mesh.vertices, mesh.faces, mesh.source
     if isinstance(mesh, str | os.PathLike):
         return read_arrays(mesh)
     try:
         vertices, faces = mesh
     except (TypeError, ValueError):
         raise InputError("give a Mesh, a pair (vertices, faces), or the path of a file") from None
-    return vertices, faces
+    return vertices, faces, None
 
 
 def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
@@ -51,7 +52,7 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
         >>> mesh, new.tolist()
         (Mesh(3 vertices, 1 faces), [0, 1, 2, 2, -1])
     """
-    points, faces = checked_arrays(*_arrays(mesh))
+    points, faces = checked_arrays(*_arrays(mesh)[:2])
     points, merged = merge_equal_points(points)
     faces = merged[faces]
     faces = np.delete(faces, [face for _, face in degenerate_faces(points, faces)], axis=0)
@@ -97,18 +98,26 @@ def inspect(mesh: MeshLike) -> Inspection:
         >>> jd.inspect(jd.shapes.bar()).findings
         ()
     """
-    arrays = _arrays(mesh)
-    try:
-        points, faces = checked_arrays(*arrays)
-    except InputError as error:
-        return Inspection({}, (f"Unusable: {error}",))
-    n, m = len(points), len(faces)
+    vertices, faces, source = _arrays(mesh)
     findings: list[str] = []
 
     def report(count: int, what: str, move: str) -> None:
         if count:
             findings.append(f"{count} {what}: {move}")
 
+    if source:
+        polygons = int((source.polygons.sizes > 3).sum())
+        report(
+            polygons,
+            "faces have more than three corners",
+            "cut into triangles for the work, kept as they are in a file of the same mesh",
+        )
+        report(source.trailing, "bytes follow the end of the mesh", "they are not read")
+    try:
+        points, faces = checked_arrays(vertices, faces)
+    except InputError as error:
+        return Inspection({}, (f"Unusable: {error}", *findings))
+    n, m = len(points), len(faces)
     bad = degenerate_faces(points, faces)
     repeating = [k for reason, k in bad if reason.startswith("repeats")]
     flat = [k for reason, k in bad if reason.startswith("has")]

@@ -2,13 +2,14 @@
 
 import hashlib
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.parsed import Source
 
 # A triangle has no area if its height is below this fraction of its longest edge: float64 cannot
 # tell such an area from rounding, and the cotangents would be noise. Thin but real triangles
@@ -30,6 +31,7 @@ class Mesh:
 
     - vertices: (vertices, 3), in any unit of length.
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
+    - source: what :func:`load_mesh` remembers of the file, for :func:`save_mesh`.
 
     **Raises** InputError: an array is empty or has the wrong shape; a vertex is not finite; a face
     index is out of range; a face repeats a vertex or has no area (:func:`repair` drops those).
@@ -44,8 +46,14 @@ class Mesh:
     """Positions, in any unit of length."""
     faces: Int[np.ndarray, "faces 3"]
     """Vertex indices, counter-clockwise seen from outside."""
+    source: Source | None
+    """The file that the mesh was read from, so that it can be written with other positions. It is
+    pickled with the mesh, but meshes with the same numbers are equal whatever file they are from:
+    it changes no result."""
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, *, source: Source | None = None
+    ) -> None:
         """Copy, check and freeze the arrays."""
         vertices, faces = checked_arrays(vertices, faces)
         for reason, face in degenerate_faces(vertices, faces):
@@ -56,6 +64,7 @@ class Mesh:
         for name, array in (("vertices", vertices), ("faces", faces)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        object.__setattr__(self, "source", source)
 
     @property
     def n_vertices(self) -> int:
@@ -103,8 +112,8 @@ class Mesh:
         return hash(self.digest)
 
     def __reduce__(self):
-        """Pickle the two arrays; loading checks and freezes them again."""
-        return Mesh, (self.vertices, self.faces)
+        """Pickle the arrays and the source; loading checks and freezes the arrays again."""
+        return partial(Mesh, source=self.source), (self.vertices, self.faces)
 
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
