@@ -106,8 +106,10 @@ def rewrite_obj(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
     faces = [k for k, keyword in enumerate(keywords) if keyword == b"f"]
     if not at or not faces:
         return b"".join(out)
+    known: dict[bytes, int] = {}
+    alike = [known.setdefault(b" ".join(_corner_words(lines[k])), len(known)) for k in at]
     named = _named_normals(keywords, lines)
-    normals, index = _new_normals(points, polygons, named, len(at))
+    normals, index = _new_normals(points, polygons, named, np.array(alike))
     text = [[b"%.6f" % x for x in row] for row in normals.tolist()]
     used = np.isin(np.arange(len(normals)), index)
     for k, line in enumerate(at):
@@ -186,19 +188,27 @@ def _plain(line: bytes) -> bytes:
 
 
 def _new_normals(
-    points: np.ndarray, polygons: Polygons, named: Int[np.ndarray, "corners"], count: int
+    points: np.ndarray,
+    polygons: Polygons,
+    named: Int[np.ndarray, "corners"],
+    alike: Int[np.ndarray, "old"],
 ) -> tuple[Float[np.ndarray, "normals 3"], Int[np.ndarray, "corners"]]:
-    """Return the normals, of which the first ``count`` were there, and which each corner names.
+    """Return the normals, of which the first are the old ones, and which each corner names.
 
-    The normal of a vertex is that of the faces that name the same old normal there, weighted by
-    area. So a smooth surface stays smooth, and a sharp edge stays sharp.
+    The normal of a vertex is that of the faces whose old normals there were alike (``alike`` has
+    the same number for those), weighted by area. So a smooth surface stays smooth, and a sharp edge
+    stays sharp.
     """
+    count = len(alike)
     named = np.where(named < count, named, -1)
-    vectors = np.repeat(area_vectors(points, polygons), polygons.sizes, axis=0)
     has = np.flatnonzero(named >= 0)
-    code = named[has] * len(points) + polygons.corners[has]
-    pairs, inverse = np.unique(code, return_inverse=True)
-    normal = unit(summed(vectors[has], inverse, len(pairs)))
+    vertex = polygons.corners[has]
+    vectors = np.repeat(area_vectors(points, polygons), polygons.sizes, axis=0)[has]
+    _, group = np.unique(alike[named[has]] * len(points) + vertex, return_inverse=True)
+    sums = summed(vectors, group, int(group.max(initial=-1)) + 1)
+    code = named[has] * len(points) + vertex
+    pairs, one, inverse = np.unique(code, return_index=True, return_inverse=True)
+    normal = unit(sums[group[one]])
     old = pairs // len(points)
     _, first = np.unique(old, return_index=True)
     leader = np.repeat(first, np.diff(np.append(first, len(pairs))))
