@@ -24,6 +24,16 @@ class InputError(ValueError):
         super().__init__(printable(text, _LONGEST))
 
 
+def shown(value: Any) -> str:
+    """Return one short line for any value."""
+    try:
+        text = repr(value) if isinstance(value, str | bytes) else str(value)
+    except ValueError:  # an integer of more than 4300 digits
+        text = f"a {type(value).__name__} too long to print"
+    text = " ".join(text.split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def printable(text: str, longest: int | None = None) -> str:
     r"""Return the text with escapes for what no terminal should get, such as ``\x1b``.
 

@@ -101,7 +101,7 @@ def save_mesh(
         array([0.5, 0.5])
     """
     path = Path(path)
-    suffix = _suffix(path)
+    suffix = format_of(path)
     points = np.asarray(mesh.vertices if vertices is None else vertices, np.float64)
     if points.shape != mesh.vertices.shape:
         raise InputError(
@@ -140,7 +140,7 @@ def _content(
     source = mesh.source if mesh.source and mesh.source.suffix == suffix else None
     if source and rigidity is None and np.array_equal(points, mesh.vertices):
         return source.data
-    if suffix == ".stl" and (source is None or is_binary(source.data)):
+    if _is_binary_stl(suffix, mesh):
         loss = check_single_precision(path, points, mesh.faces)
         if loss:
             warnings.warn(loss, stacklevel=3)
@@ -177,7 +177,7 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
         (722,)
     """
     path = Path(path)
-    if _suffix(path) != ".ply":
+    if format_of(path) != ".ply":
         raise InputError(f"{path}: rigidity is kept in .ply files only")
     columns = vertex_columns(path, without_mark(read_bytes(path)))
     if "rigidity" not in columns:
@@ -206,9 +206,10 @@ def read_arrays(path: str | os.PathLike) -> FileArrays:
     unknown, or it holds no faces.
     """
     path = Path(path)
-    suffix = _suffix(path)
+    suffix = format_of(path)
     data = read_bytes(path)
-    points, polygons, trailing = FORMATS[suffix].parse(path, without_mark(data))
+    with np.errstate(invalid="ignore"):  # what is not finite is refused later
+        points, polygons, trailing = FORMATS[suffix].parse(path, without_mark(data))
     if not len(polygons.sizes):
         raise InputError(
             f"{path}: holds {len(points)} points and no faces: make a surface of them first"
@@ -223,7 +224,7 @@ def read_arrays(path: str | os.PathLike) -> FileArrays:
     return FileArrays(points, triangles(points, polygons), source)
 
 
-def _suffix(path: Path) -> str:
+def format_of(path: Path) -> str:
     """Return the suffix of the format, without the ``.gz`` behind it."""
     suffix = Path(path.stem).suffix if path.suffix.lower() == ".gz" else path.suffix
     if suffix.lower() not in FORMATS:
@@ -231,13 +232,25 @@ def _suffix(path: Path) -> str:
     return suffix.lower()
 
 
-def check_output(path: str | os.PathLike) -> None:
-    """Raise InputError if the suffix is unknown or the folder cannot be written.
+def check_output(path: str | os.PathLike, mesh: Mesh | None = None) -> None:
+    """Raise InputError if a file, or this mesh at rest, cannot be written under this name.
 
     Example:
         >>> from jaxdeform._mesh.files import check_output
         >>> check_output("bent.ply")
     """
     path = Path(path)
-    _suffix(path)
+    suffix = format_of(path)
     check_place(path)
+    if mesh and _is_binary_stl(suffix, mesh):
+        check_single_precision(path, mesh.vertices, mesh.faces)
+
+
+def without_suffix(path: Path) -> Path:
+    """Return the path without the suffix of the format, and without ``.gz``."""
+    return (path.with_suffix("") if path.suffix.lower() == ".gz" else path).with_suffix("")
+
+
+def _is_binary_stl(suffix: str, mesh: Mesh) -> bool:
+    text = mesh.source and mesh.source.suffix == ".stl" and not is_binary(mesh.source.data)
+    return suffix == ".stl" and not text

@@ -138,8 +138,9 @@ def inspect(mesh: MeshLike) -> Inspection:
     report(repeated, "faces are repeated", "their edges weigh double; jd.repair drops them")
     counts: dict[str, int | float] = {"vertices": n, "faces": m}
     if len(sound):
-        _inspect_structure(points, sound, counts, report)
-        _inspect_angles(points, sound, counts, report)
+        with np.errstate(all="ignore"):  # numbers near the ends of the range of float64
+            _inspect_structure(points, sound, counts, report)
+            _inspect_angles(points, sound, counts, report)
     return Inspection(counts, tuple(findings))
 
 

@@ -70,7 +70,7 @@ def _face(path: Path, number: int, words: list[bytes]) -> list[int]:
         raise damaged(path, f"line {number} is a face with {len(words) - 1} corners")
     try:
         corners = [word.split(b"/", 1)[0] if b"/" in word else word for word in words[1:]]
-        if b"_" in b"".join(corners):
+        if b"_" in b"".join(corners) or b"\\" in b"".join(words):
             raise ValueError
         return list(map(int, corners))
     except ValueError:

@@ -106,6 +106,8 @@ def _corners(path: Path, line: bytes, element: Element, name: str) -> list[int]:
     words = line.split()
     try:
         at = text_place(words, element, name)
+        if len(element.properties) > 1 and text_place(words, element, "") > len(words):
+            raise IndexError
     except (ValueError, IndexError):
         raise damaged(path, f"the line {shown(words)} is not a face") from None
     if element.name == "tristrips":

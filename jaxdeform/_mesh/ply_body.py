@@ -123,7 +123,10 @@ def text_rows(path: Path, lines: list[bytes], header: Header) -> tuple[dict, lis
 
 
 def text_place(words: list[bytes], element: Element, name: str) -> int:
-    """Return which word of a line begins a property, or raise ValueError or IndexError."""
+    """Return which word of a line begins a property, or raise ValueError or IndexError.
+
+    Without such a property it is the number of words that all of them take.
+    """
     at = 0
     for item in element.properties:
         if item.name == name:

@@ -1,8 +1,10 @@
 """Read the bytes of regular files: a pipe could hang, and a device may never end."""
 
+import json
 import stat
 import zlib
 from pathlib import Path
+from typing import Any
 
 from jaxdeform._errors import InputError
 
@@ -56,6 +58,15 @@ def read_text(path: Path) -> str:
         return without_mark(read_bytes(path)).decode("utf-8")
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not a text file (UTF-8): check the name") from None
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file, or raise InputError."""
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:  # not JSON, numbers too long, lists too deep
+        raise InputError(f"{path}: is not valid JSON ({error}): correct it there") from error
 
 
 def _decompressed(path: Path, data: bytes) -> bytes:

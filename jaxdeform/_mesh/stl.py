@@ -15,10 +15,13 @@ from jaxdeform._mesh.polygons import (
     from_triangles,
     unit,
 )
-from jaxdeform._mesh.words import content, damaged, position, stacked, text_of, with_words
+from jaxdeform._mesh.words import content, damaged, position, shown, stacked, text_of, with_words
 
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 _HEAD = 84
+
+# Lines that stay as they are.
+_KEPT = frozenset(b"solid outer endloop endsolid color".split())
 
 
 def parse_stl(path: Path, data: bytes) -> Parsed:
@@ -54,7 +57,7 @@ def is_binary(data: bytes) -> bool:
 def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"], Polygons]:
     corners: list[tuple[float, ...]] = []
     sizes: list[int] = []
-    used, last = 0, b""
+    facets, used, last = 0, 0, b""
     for number, line in enumerate(data.splitlines(), 1):
         words = content(line)
         if not words:
@@ -62,14 +65,21 @@ def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"]
         last = words[0].lower()
         if last == b"vertex":
             corners.append(position(path, number, words[1:]))
+        elif last == b"facet":
+            facets += 1
         elif last == b"endfacet":
             sizes.append(len(corners) - used)
             used = len(corners)
             if sizes[-1] < 3:
                 raise damaged(path, f"face {len(sizes) - 1} is a face with {sizes[-1]} corners")
+        elif last not in _KEPT:
+            raise InputError(
+                f"{path}: line {number} {shown(words)} begins with an unknown keyword: correct it, "
+                "or put # before it"
+            )
     if last != b"endsolid":
         raise damaged(path, "does not end with endsolid")
-    if used != len(corners):
+    if used != len(corners) or facets != len(sizes):
         raise damaged(path, "has a face that does not end with endfacet")
     return stacked(corners), from_lists(sizes, list(range(used)))
 
