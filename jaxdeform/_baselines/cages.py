@@ -39,6 +39,8 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "ver
         >>> np.allclose(weights @ cage.vertices, [[1.0, 60.0, 2.0]])
         True
     """
+    if len(cage.solid_faces) < cage.n_faces:
+        raise InputError("the cage has faces without area: drop them with jd.repair(cage)")
     points = np.asarray(vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"vertices have shape {points.shape}: give (vertices, 3), all finite")

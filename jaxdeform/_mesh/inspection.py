@@ -10,6 +10,7 @@ from jaxtyping import Int
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
+    NO_AREA,
     Mesh,
     checked_arrays,
     connected_components,
@@ -119,15 +120,19 @@ def inspect(mesh: MeshLike) -> Inspection:
         return Inspection({}, (f"Unusable: {error}", *findings))
     n, m = len(points), len(faces)
     bad = degenerate_faces(points, faces)
-    repeating = [k for reason, k in bad if reason.startswith("repeats")]
-    flat = [k for reason, k in bad if reason.startswith("has")]
+    repeating = [k for reason, k in bad if reason != NO_AREA]
+    flat = [k for reason, k in bad if reason == NO_AREA]
     remedy = "jd.repair drops them"
     report(len(repeating), f"faces repeat a vertex (face {(repeating or [0])[0]})", remedy)
-    report(len(flat), f"faces have no area (face {(flat or [0])[0]})", remedy)
+    report(
+        len(flat),
+        f"faces have no area (face {(flat or [0])[0]})",
+        f"their edges weigh nothing; {remedy}",
+    )
     sound = np.delete(faces, [k for _, k in bad], axis=0)
     sound = sound[np.unique(np.sort(sound, axis=1), axis=0, return_index=True)[1]]
-    unreferenced = n - len(np.unique(faces))
-    report(unreferenced, "vertices belong to no face", "they stay where they are")
+    unreferenced = n - len(np.unique(np.delete(faces, flat, axis=0)))
+    report(unreferenced, "vertices belong to no face with an area", "they stay where they are")
     duplicates = n - len(np.unique(points, axis=0))
     report(
         duplicates,

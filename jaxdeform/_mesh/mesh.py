@@ -16,13 +16,17 @@ from jaxdeform._mesh.parsed import Source
 # (0.4 degrees) lie a factor of 1e10 above it.
 _FLAT = 1e-13
 
+NO_AREA = "has no area"
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A triangle mesh, checked once when it is made, then frozen.
 
     Open borders, several connected components, unreferenced vertices, non-manifold edges and
-    vertices, and inward-facing faces are all allowed; :func:`inspect` reports them.
+    vertices, inward-facing faces, and faces without area are all allowed; :func:`inspect` reports
+    them. A face without area is kept for files and pictures, but its edges weigh nothing, as in
+    other ARAP programs: a vertex that has no other face stays where it is.
 
     A mesh is a value. Two meshes with the same numbers are equal and have the same hash, even after
     pickling or in another process. The arrays are read-only: copy one before you change it.
@@ -34,7 +38,7 @@ class Mesh:
     - source: what :func:`load_mesh` remembers of the file, for :func:`save_mesh`.
 
     **Raises** InputError: an array is empty or has the wrong shape; a vertex is not finite; a face
-    index is out of range; a face repeats a vertex or has no area (:func:`repair` drops those).
+    index is out of range; a face repeats a vertex, or none has an area (:func:`repair`).
 
     Example:
         >>> import jaxdeform as jd
@@ -46,6 +50,8 @@ class Mesh:
     """Positions, in any unit of length."""
     faces: Int[np.ndarray, "faces 3"]
     """Vertex indices, counter-clockwise seen from outside."""
+    solid_faces: Int[np.ndarray, "solid 3"]
+    """The faces that have an area. Only these have edges, and so a part in the energy."""
     source: Source | None
     """The file that the mesh was read from, so that it can be written with other positions. It is
     pickled with the mesh, but meshes with the same numbers are equal whatever file they are from:
@@ -56,12 +62,15 @@ class Mesh:
     ) -> None:
         """Copy, check and freeze the arrays."""
         vertices, faces = checked_arrays(vertices, faces)
-        for reason, face in degenerate_faces(vertices, faces):
-            raise InputError(
-                f"face {face} {faces[face].tolist()} {reason}: drop such faces with "
-                "jd.repair((vertices, faces))"
-            )
-        for name, array in (("vertices", vertices), ("faces", faces)):
+        bad = degenerate_faces(vertices, faces)
+        for reason, face in bad:
+            if reason != NO_AREA or len(bad) == len(faces):
+                raise InputError(
+                    f"face {face} {faces[face].tolist()} {reason}: drop such faces with "
+                    "jd.repair((vertices, faces))"
+                )
+        solid = np.delete(faces, [face for _, face in bad], axis=0) if bad else faces
+        for name, array in (("vertices", vertices), ("faces", faces), ("solid_faces", solid)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         object.__setattr__(self, "source", source)
@@ -78,14 +87,14 @@ class Mesh:
 
     @cached_property
     def edges(self) -> Int[np.ndarray, "edges 2"]:
-        """Undirected edges (i < j), each once, in ascending order."""
-        return unique_edges(self.faces)
+        """Undirected edges (i < j) of faces with an area, each once, in ascending order."""
+        return unique_edges(self.solid_faces)
 
     @cached_property
     def referenced(self) -> Bool[np.ndarray, "vertices"]:
-        """True for each vertex that belongs to a face."""
+        """True for each vertex that belongs to a face with an area."""
         mask = np.zeros(self.n_vertices, bool)
-        mask[self.faces.ravel()] = True
+        mask[self.solid_faces.ravel()] = True
         return mask
 
     @cached_property
@@ -95,7 +104,7 @@ class Mesh:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the bounding box of the vertices that belong to a face."""
+        """Diagonal of the bounding box of the referenced vertices."""
         return float(np.linalg.norm(np.ptp(self.vertices[self.referenced], axis=0)))
 
     @cached_property
@@ -169,7 +178,7 @@ def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, i
     size = np.where(longest > 0, longest, 1.0)[:, None]
     area = np.linalg.norm(np.cross(u / size, v / size), axis=1)
     flat = (area <= _FLAT) & ~repeats
-    return found + [("has no area", int(k)) for k in np.flatnonzero(flat)]
+    return found + [(NO_AREA, int(k)) for k in np.flatnonzero(flat)]
 
 
 def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
