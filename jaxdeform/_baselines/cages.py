@@ -29,8 +29,8 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "ver
 
     **Returns** (vertices, controls) weights.
 
-    **Raises** InputError: the cage is open or its faces are not oriented alike; a point is outside
-    the cage or not finite.
+    **Raises** InputError: the cage has faces without area; it is open or its faces are not
+    oriented alike; a point is outside the cage or not finite.
 
     Example:
         >>> import jaxdeform as jd, numpy as np

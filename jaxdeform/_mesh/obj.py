@@ -59,6 +59,9 @@ def parse_obj(path: Path, data: bytes) -> Parsed:
             raise damaged(
                 path, f"announces {announced[kind]} {kind.decode().lower()} but holds fewer"
             )
+    # Who writes counts ends lines. Without its end, a last face may have lost corners.
+    if announced and not data.endswith((b"\n", b"\r")):
+        raise damaged(path, "ends within a line")
     try:
         return Parsed(stacked(points), from_lists(sizes, corners))
     except OverflowError:
