@@ -1,90 +1,218 @@
-"""Read arguments as arrays and check them, or raise an InputError that names them."""
+"""Check arguments, or raise an InputError that names them, the reason, and the next move."""
 
-from typing import NamedTuple
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._arrays import is_concrete, read_array, read_host_array, read_integers
+from jaxdeform._errors import ArrayLike, InputError, a_or_an, shown
+
+# ---------------------------------------------------------------- other types than arrays
+
+# What to do with a value of another type. The key "" stands for all other types.
+_INSTEAD = {
+    "Mesh": {
+        "path": "read it with jd.load_mesh(path)",
+        "pair": "make one with jd.Mesh(vertices, faces)",
+        "Problem": "give problem.mesh",
+        "Cells": "give cells.mesh",
+        "Submesh": "give submesh.mesh",
+        "": "give a jd.Mesh: jd.Mesh(vertices, faces) makes one, jd.load_mesh(path) reads one",
+    },
+    "Cells": {
+        "int": "give jd.rings(mesh, r)",
+        "": "give jd.rings(mesh, r) or jd.spokes(mesh)",
+    },
+    "Problem": {
+        "Mesh": "call jd.precompute(mesh, handles) first",
+        "Cells": "call jd.precompute(cells.mesh, handles, cells=cells) first",
+        "path": "call jd.precompute(jd.load_mesh(path), handles) first",
+        "": "give what jd.precompute(mesh, handles) returns",
+    },
+    "Source": {
+        "Mesh": "give mesh.source",
+        "path": "give jd.load_mesh(path).source",
+        "": "give mesh.source of a mesh that jd.load_mesh read, or None",
+    },
+}
 
 
-def is_concrete(x) -> bool:
-    """Return whether the values of an array can be read now; while JAX traces they cannot."""
-    return not isinstance(x, Tracer)
+def check_type(name: str, value: object, kind: type) -> None:
+    """Raise InputError unless the value is of this type: it says what was given, what to give."""
+    if isinstance(value, kind):
+        return
+    form = type(value).__name__
+    if isinstance(value, str | os.PathLike):
+        form = "path"
+    elif isinstance(value, list | tuple) and len(value) == 2:
+        form = "pair"
+        if isinstance(value[0], kind):
+            raise InputError(f"{name} is a pair: give its first entry, {shown(value[0])}")
+    moves = _INSTEAD[kind.__name__]
+    raise InputError(f"{name} is {a_or_an(value)}: {moves.get(form, moves[''])}")
 
 
-def as_array(value, dtype: np.dtype, name: str) -> Array:
-    """Return the value as a JAX array, or raise InputError naming the argument."""
-    return jnp.asarray(read_array(value, dtype, name))
-
-
-def read_array(value, dtype: np.dtype, name: str) -> Array | np.ndarray:
-    """Like :func:`as_array`, but validate without moving NumPy arrays to the device.
-
-    A compiled function takes a NumPy array directly, 0.1 ms sooner than one that JAX is still
-    copying.
-    """
+def check_setting(name: str, value: object, methods: tuple[str, ...], example: str) -> None:
+    """Raise InputError unless the value has these attributes and can be hashed."""
+    if isinstance(value, str):
+        raise InputError(f"{name} is the text {shown(value)}: give {example}")
+    if isinstance(value, type):
+        raise InputError(f"{name} is the class {value.__name__}: give {value.__name__}() instead")
+    for method in methods:
+        if not hasattr(value, method):
+            raise InputError(f"{name} is {a_or_an(value)}, without {method}: give {example}")
     try:
-        if isinstance(value, np.ndarray | float | int) and np.asarray(value).dtype.kind in "iuf":
-            with np.errstate(over="ignore"):  # overflow gives infinity, refused later
-                return np.asarray(value, dtype)
-        return jnp.asarray(value, dtype)
-    except (TypeError, ValueError) as error:
-        if isinstance(value, Tracer):
-            raise
-        raise InputError(f"{name} cannot be read as numbers: {error}") from error
+        hash(value)
+    except TypeError as error:
+        raise InputError(
+            f"{name} of type {type(value).__name__} is not hashable, so compiled code cannot be "
+            "kept for it: make it a frozen dataclass with numbers for fields"
+        ) from error
 
 
-def check_positions(name: str, value, shape: tuple, dtype: np.dtype, unit: str = "vertex") -> Array:
+def read_path(name: str, value: str | os.PathLike | Any) -> Path:
+    """Return a path whose name the system can take, or raise InputError."""
+    if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
+        raise InputError(f"{name} is {a_or_an(value)}: give the name of a file, a str or a Path")
+    try:
+        if b"\0" in os.fsencode(value):
+            raise InputError(f"{name} {shown(value)} holds a NUL character: give another name")
+    except UnicodeEncodeError as error:
+        raise InputError(f"{name} {shown(value)} cannot be encoded: give another name") from error
+    return Path(value)
+
+
+def check_function(name: str, value: Callable | Any | None, arguments: str) -> None:
+    """Raise InputError unless the value can be called, or is None."""
+    if value is not None and not callable(value):
+        raise InputError(f"{name} is {a_or_an(value)}: give a function of ({arguments}), or None")
+
+
+def check_count(name: str, value: Any, least: int = 1, most: int = 1_000_000) -> int:
+    """Return a whole number within bounds, or raise InputError naming the setting."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not least <= value <= most:
+        raise InputError(f"{name} is {shown(value)}: give a whole number from {least} to {most}")
+    return int(value)
+
+
+def check_tolerance(name: str, value: Any, *, positive: bool = False) -> float:
+    """Return a finite number of 0 or more (or above 0), or raise InputError naming the setting."""
+    real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not real or not 0 <= value <= sys.float_info.max or (positive and value == 0):
+        bound = "above 0" if positive else "0 or more"
+        raise InputError(f"{name} is {shown(value)}: give a finite number, {bound}")
+    return float(value)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return True or False, or raise InputError naming the setting."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} is {shown(value)}: give True or False")
+    return bool(value)
+
+
+def check_precision(name: str, dtype: np.dtype) -> None:
+    """Raise InputError for float64 numbers while JAX is set to float32."""
+    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise InputError(
+            f"{name} is float64, but jax_enable_x64 is off now: switch it on again, or make a new "
+            f"{name}, which will be float32"
+        )
+
+
+# ---------------------------------------------------------------- arguments that many take
+
+
+def check_positions(
+    name: str, value: ArrayLike, shape: tuple, dtype: np.dtype, unit: str = "vertex"
+) -> Array:
     """Return a JAX array of this shape, or raise InputError; finite, if its values are known."""
     return jnp.asarray(read_positions(name, value, shape, dtype, unit))
 
 
 def read_positions(
-    name: str, value, shape: tuple, dtype: np.dtype, unit: str = "vertex"
+    name: str, value: ArrayLike, shape: tuple, dtype: np.dtype, unit: str = "vertex"
 ) -> Array | np.ndarray:
     """Like :func:`check_positions`, but without moving NumPy arrays to the device."""
     array = read_array(value, dtype, name)
     if array.shape != shape:
         raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
     if is_concrete(array):
-        bad = np.flatnonzero(~np.isfinite(np.asarray(array)).reshape(shape[0], -1).all(axis=1))
+        finite = np.isfinite(np.asarray(array)).all(axis=tuple(range(1, array.ndim)))
+        bad = np.flatnonzero(~finite)
         if bad.size:
             raise InputError(f"{name} of {unit} {bad[0]} are not finite: give finite numbers")
     return array
 
 
-def check_handles(handles: ArrayLike, n: int) -> Int[np.ndarray, "handles"]:
-    """Return the handle indices as an array, or raise InputError naming what is wrong."""
-    given = np.asarray(handles)
-    if given.ndim != 1:
-        raise InputError(f"handles have shape {given.shape}: give one list of vertex indices")
-    if given.size == 0:
-        raise InputError("no handles: without one the mesh could lie anywhere; give at least one")
-    if given.dtype.kind not in "iu":
-        hint = ": use np.flatnonzero(mask)" if given.dtype == bool else ": give vertex indices"
-        raise InputError(f"handles must be integers, got {given.dtype}{hint}")
+def read_host_positions(
+    name: str, value: ArrayLike, shape: tuple, unit: str = "vertex"
+) -> np.ndarray:
+    """Like :func:`read_positions`, for code that NumPy runs, in float64."""
+    given = read_host_array(value, np.float64, name)
+    return np.asarray(read_positions(name, given, shape, given.dtype, unit))
+
+
+def rows_of_three(
+    name: str, value: ArrayLike, dtype: np.dtype, unit: str = "vertex"
+) -> Float[Array, "rows 3"]:
+    """Return finite positions (rows, 3), at least one, or raise InputError naming the argument."""
+    return jnp.asarray(_read_rows(name, read_array(value, dtype, name), unit))
+
+
+def host_rows_of_three(name: str, value: ArrayLike) -> Float[np.ndarray, "rows 3"]:
+    """Like :func:`rows_of_three`, for code that NumPy runs, in float64."""
+    return np.asarray(_read_rows(name, read_host_array(value, np.float64, name), "vertex"))
+
+
+def _read_rows(name: str, array: Array | np.ndarray, unit: str) -> Array | np.ndarray:
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise InputError(f"{name} have shape {array.shape}: give (n, 3), at least one {unit}")
+    return read_positions(name, array, array.shape, array.dtype, unit)
+
+
+def check_index(
+    name: str, given: Int[np.ndarray, "indices"], n: int, *, unit: str = "vertices"
+) -> None:
+    """Raise InputError unless all indices are within 0 to n - 1."""
     outside = np.flatnonzero((given < 0) | (given >= n))
     if outside.size:
         raise InputError(
-            f"handle {given[outside[0]]} (position {outside[0]}) is out of range: vertices are 0 "
+            f"{name} {given[outside[0]]} (position {outside[0]}) is out of range: {unit} are 0 "
             f"to {n - 1}"
         )
+
+
+def check_handles(
+    handles: ArrayLike, n: int, *, name: str = "handle"
+) -> Int[np.ndarray, "handles"]:
+    """Return the handle indices as an array, or raise InputError naming what is wrong."""
+    given = read_integers(handles, f"{name}s")
+    if given.ndim != 1:
+        raise InputError(f"{name}s have shape {given.shape}: give one list of vertex indices")
+    if given.size == 0:
+        raise InputError(f"no {name}s: without one the mesh could lie anywhere; give at least one")
+    check_index(name, given, n)
     unique, count = np.unique(given, return_counts=True)
     if (count > 1).any():
         raise InputError(
-            f"vertex {unique[count > 1][0]} is a handle {count.max()} times: list it once, because "
+            f"vertex {unique[count > 1][0]} is a {name} {count.max()} times: list it once, because "
             "it can have only one target"
         )
-    return given.astype(np.int64)
+    return given
 
 
 def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     """Return one weight per handle, infinite for a hard handle, or raise InputError."""
-    given = np.asarray(weights, np.float64)
+    given = read_host_array(weights, np.float64, "handle_weights")
     if given.ndim and given.shape != index.shape:
         raise InputError(
             f"handle_weights have shape {given.shape}: give one number or one per handle, "
@@ -100,100 +228,53 @@ def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     return given
 
 
-def check_components(mesh: Mesh, anchored: Int[np.ndarray, "anchored"]) -> None:
-    """Raise InputError if a connected component of the mesh has no handle."""
-    label = mesh.components
-    loose = np.flatnonzero(mesh.referenced & ~np.isin(label, label[anchored]))
-    if loose.size:
-        k = int(loose[0])
-        size = int((label == label[k]).sum())
-        raise InputError(
-            f"the connected component with vertex {k} ({size} vertices) has no handle, so it could "
-            "lie anywhere: add a handle there, or drop the component"
-        )
-
-
-class HandleSplit(NamedTuple):
-    """The vertices of a mesh, split into hard handles, soft handles and free vertices."""
-
-    index: Int[np.ndarray, "handles"]
-    """The handles, in the order given."""
-    free: Bool[np.ndarray, "vertices"]
-    """True for each vertex that is solved for: it has a face and is not a hard handle."""
-    soft: Float[np.ndarray, "vertices"]
-    """The weight of each soft handle; 0 elsewhere."""
-
-
-def split_handles(mesh: Mesh, handles: ArrayLike, handle_weights: ArrayLike) -> HandleSplit:
-    """Split the vertices into hard handles, soft handles and free vertices, or raise InputError."""
-    index = check_handles(handles, mesh.n_vertices)
-    weights = check_handle_weights(handle_weights, index)
-    check_components(mesh, index[weights > 0])
-    is_soft = np.isfinite(weights)
-    free, soft = mesh.referenced.copy(), np.zeros(mesh.n_vertices)
-    free[index[~is_soft]] = False
-    soft[index[is_soft]] = weights[is_soft]
-    return HandleSplit(index, free, soft)
-
-
-def check_count(name: str, value: int, least: int = 1, most: int = 1_000_000) -> int:
-    """Return a whole number within bounds, or raise InputError naming the setting."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or not least <= value <= most:
-        raise InputError(f"{name} is {value}: give a whole number from {least} to {most}")
-    return int(value)
-
-
-def check_tolerance(name: str, value: float) -> float:
-    """Return a finite number of 0 or more, or raise InputError naming the setting."""
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not 0 <= value < np.inf:
-        raise InputError(f"{name} is {value}: give a finite number, 0 or more")
-    return float(value)
-
-
 def check_targets(targets: ArrayLike, count: int, dtype: np.dtype) -> Array | np.ndarray:
     """Return the targets as an array (handles, 3), or raise InputError naming what is wrong."""
     return read_positions("targets", targets, (count, 3), dtype, unit="handle")
 
 
-def check_groups(group: ArrayLike, count: int) -> Int[np.ndarray, "handles"]:
-    """Return one group number >= 0 per handle, or raise InputError naming what is wrong."""
-    given = np.asarray(group)
-    if given.shape != (count,) or given.dtype.kind not in "iu":
+def check_labels(
+    name: str, value: ArrayLike, count: int, unit: str, end: int
+) -> Int[np.ndarray, "labels"]:
+    """Return one number from 0 to end - 1 per vertex or handle, or raise InputError.
+
+    ``end`` keeps a number from reserving memory for all the smaller ones.
+    """
+    given = read_integers(value, name, f"give one integer per {unit}")
+    if given.shape != (count,):
         raise InputError(
-            f"group has shape {given.shape} and type {given.dtype}: give one integer per handle, "
-            f"({count},)"
+            f"{name} {'have' if name.endswith('s') else 'has'} shape {given.shape}: give one "
+            f"integer per {unit}, ({count},)"
         )
-    bad = np.flatnonzero(given < 0)
+    bad = np.flatnonzero((given < 0) | (given >= end))
     if bad.size:
-        raise InputError(f"the group of handle {bad[0]} is {given[bad[0]]}: number groups from 0")
-    return given.astype(np.int64)
+        raise InputError(
+            f"the {name.removesuffix('s')} of {unit} {bad[0]} is {given[bad[0]]}, out of range: "
+            f"number from 0 to at most {end - 1}"
+        )
+    return given
 
 
 def check_rigidity(
-    rigidity: ArrayLike, n: int, dtype: np.dtype, *, name: str = "rigidity"
+    rigidity: ArrayLike,
+    n: int,
+    dtype: np.dtype,
+    *,
+    name: str = "rigidity",
+    unit: str = "vertex",
 ) -> Float[Array, "vertices"] | Float[np.ndarray, "vertices"]:
     """Return the rigidity as one number per vertex, or raise InputError naming what is wrong."""
     array = read_array(rigidity, dtype, name)
     if array.shape not in ((), (n,)):
         raise InputError(
-            f"{name} has shape {array.shape}: give one number, or one per vertex, ({n},)"
+            f"{name} has shape {array.shape}: give one number, or one per {unit}, ({n},)"
         )
     if is_concrete(array):
         values = np.atleast_1d(np.asarray(array))
         bad = np.flatnonzero(~((values >= 0) & np.isfinite(values)))
         if bad.size:
-            where = f" at vertex {bad[0]}" if array.shape else ""
+            where = f" at {unit} {bad[0]}" if array.shape else ""
             raise InputError(
                 f"{name} is {values[bad[0]]}{where}: it must be a finite number, 0 or more"
             )
     return (jnp if isinstance(array, Array) else np).broadcast_to(array, (n,))
-
-
-def rows_of_three(name: str, value: ArrayLike, dtype: np.dtype) -> Float[Array, "rows 3"]:
-    """Return finite positions (rows, 3), or raise InputError naming the argument."""
-    array = as_array(value, dtype, name)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name} have shape {array.shape}: give an array of shape (any, 3)")
-    return check_positions(name, array, array.shape, dtype)

@@ -1,4 +1,4 @@
-"""Misuse: its exception, and the annotation of arguments that are checked by hand."""
+"""Misuse: its exception, words for its text, and the annotation of arguments checked by hand."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +25,23 @@ class InputError(ValueError):
 
 
 def shown(value: Any) -> str:
-    """Return one short line for any value."""
+    """Return one short line for any value, without control characters."""
     try:
         text = repr(value) if isinstance(value, str | bytes) else str(value)
     except ValueError:  # an integer of more than 4300 digits
-        text = f"a {type(value).__name__} too long to print"
-    text = " ".join(text.split())
+        text = f"{a_or_an(value)} too long to print"
+    text = printable(" ".join(text.split()))
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def a_or_an(value: Any) -> str:
+    """Return the type of a value, with its article."""
+    if value is None:
+        return "None"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'aeiouAEIO' else 'a'} {name}"
 
 
 def printable(text: str, longest: int | None = None) -> str:

@@ -7,12 +7,18 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._arrays import read_host_array
+from jaxdeform._checks import check_count, check_type, read_host_positions, read_path
+from jaxdeform._errors import ArrayLike, InputError, a_or_an
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.writing import check_place, write_atomically
+
+# Where the CPU draws, 40 million pixels take 3 GB; 16,384 is the width that graphics systems allow.
+_MOST_PIXELS, _MOST_WIDTH = 40e6, 16384
 
 
 def render(
@@ -36,10 +42,11 @@ def render(
     - values: for each pose an array (vertices,), a number, or None; shown as colour, on a
       logarithmic scale if all are positive and they differ by more than a factor of 5.
     - label: the name of the values.
-    - width: the width of each view, in pixels.
+    - width: the width of each view, in pixels, from 16. Its height is 1.3 times that. The picture
+      may have 40 million pixels and be 16,384 wide.
 
     **Raises** InputError: the name does not end in .png; the folder cannot be written; pyvista is
-    not installed.
+    not installed; no poses, or of another shape than the mesh; values that are not finite.
 
     Example:
         >>> import jaxdeform as jd, pathlib, tempfile
@@ -49,25 +56,29 @@ def render(
         >>> path.stat().st_size > 1000
         True
     """
-    path = Path(path)
+    path = read_path("path", path)
+    check_type("mesh", mesh, Mesh)
+    arrays = _read_poses(mesh, poses)
+    colors = _read_values(mesh, values, len(arrays))
+    _check_texts(titles, label, len(arrays))
+    most = min((_MOST_PIXELS / 1.3 / len(arrays)) ** 0.5, _MOST_WIDTH / len(arrays))
+    check_count("width", width, least=16, most=int(most))
     check_picture_path(path)
     import pyvista  # slow to import, and needed only here
     from vtkmodules.vtkCommonCore import vtkLogger
 
     # Without a display VTK falls back to drawing in memory, which is what we want: no warning.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-    arrays = [np.asarray(pose, np.float64) for pose in poses]
     plotter = pyvista.Plotter(
         shape=(1, len(arrays)), window_size=[width * len(arrays), int(1.3 * width)], off_screen=True
     )
-    shown = [v for v in values if v is not None]
+    shown = [v for v in colors if v is not None]
     for k, pose in enumerate(arrays):
         plotter.subplot(0, k)
-        color = values[k] if k < len(values) else None
+        color = colors[k]
         options: dict[str, Any] = {"color": "lightsteelblue"}
         if color is not None:
-            scalars = np.broadcast_to(np.asarray(color, np.float64), len(pose))
-            options = {"scalars": scalars, **_color_scale(shown, label)}
+            options = {"scalars": color, **_color_scale(shown, label)}
         surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
         plotter.add_mesh(surface, show_edges=mesh.n_faces < 5000, line_width=0.5, **options)
         if k < len(titles):
@@ -81,6 +92,49 @@ def render(
     image = np.asarray(plotter.screenshot(return_img=True))
     plotter.close()
     write_atomically(path, _png(image))
+
+
+def _read_poses(mesh: Mesh, poses: Any) -> list[np.ndarray]:
+    poses = _listed("poses", poses, "positions (vertices, 3)")
+    if not poses:
+        raise InputError("poses is empty: give at least one, such as [mesh.vertices]")
+    shape = mesh.vertices.shape
+    return [read_host_positions(f"poses[{k}]", pose, shape) for k, pose in enumerate(poses)]
+
+
+def _read_values(mesh: Mesh, values: Any, count: int) -> list[np.ndarray | None]:
+    """Return one array (vertices,) or None per pose."""
+    values = _listed("values", values, "arrays, numbers or None, one per pose")
+    if len(values) > count:
+        raise InputError(f"values has {len(values)} entries for {count} poses: give one per pose")
+    out: list[np.ndarray | None] = [None] * count
+    for k, value in enumerate(values):
+        if value is not None:
+            name, n = f"values[{k}]", mesh.n_vertices
+            given = read_host_array(value, np.float64, name)
+            if given.shape not in ((), (n,)) or not np.isfinite(given).all():
+                raise InputError(
+                    f"{name} has shape {given.shape}: give None, a finite number or ({n},) of them"
+                )
+            out[k] = np.broadcast_to(given, n)
+    return out
+
+
+def _listed(name: str, value: Any, of: str) -> list:
+    """Return the entries of a list or an array; text is a list of letters, a dict of keys."""
+    array = isinstance(value, np.ndarray | jax.Array) and value.ndim > 0
+    if not array and not isinstance(value, list | tuple):
+        raise InputError(f"{name} is {a_or_an(value)}: give a list of {of}")
+    return list(value)
+
+
+def _check_texts(titles: Any, label: Any, count: int) -> None:
+    titles = _listed("titles", titles, "texts, one per pose")
+    if len(titles) > count:
+        raise InputError(f"titles has {len(titles)} entries for {count} poses: give one per pose")
+    for name, text in [("label", label), *((f"titles[{k}]", t) for k, t in enumerate(titles))]:
+        if not isinstance(text, str):
+            raise InputError(f"{name} is {a_or_an(text)}: give a text")
 
 
 def _color_scale(shown: Sequence[ArrayLike], label: str) -> dict[str, Any]:

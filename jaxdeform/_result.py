@@ -28,6 +28,14 @@ class Result(eqx.Enumeration):
         "step, float64, or another scale of the targets and the rigidity (its unit is length "
         "squared)."
     )
+    bad_input = (
+        "Not solved: a target, weight or rest position is not finite, or a rigidity or weight is "
+        "negative. Outside jit, the same call raises and names the entry."
+    )
+    out_of_proportion = (
+        "Not to be trusted: the energy is negative, or vertices lie more than ten diagonals from "
+        "the mesh and its targets. Check the targets, and whether a rigidity near 0 resists enough."
+    )
     fitted = "Converged: a further step would not lower the misfit visibly."
     settled = "Stopped: rigidity changed by less than the threshold."
     evaluation_limit = (

@@ -20,8 +20,8 @@ PACKAGE = ROOT / "jaxdeform"
 # From the ground up. A module imports from lower floors, or from its own without a circle.
 FLOORS = [
     ["_errors", "_result"],
+    ["_arrays", "_checks"],
     ["_mesh"],
-    ["_checks"],
     ["_linalg"],
     ["_handles"],
     ["_deformation"],

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
+from jaxdeform._checks import check_type, host_rows_of_three
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
 
@@ -39,11 +40,10 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "ver
         >>> np.allclose(weights @ cage.vertices, [[1.0, 60.0, 2.0]])
         True
     """
+    check_type("cage", cage, Mesh)
+    points = host_rows_of_three("vertices", vertices)
     if len(cage.solid_faces) < cage.n_faces:
         raise InputError("the cage has faces without area: drop them with jd.repair(cage)")
-    points = np.asarray(vertices, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InputError(f"vertices have shape {points.shape}: give (vertices, 3), all finite")
     _check_cage(points, cage)
     faces, corners = cage.faces, cage.vertices
     out = np.empty((len(points), len(corners)))

@@ -6,8 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._checks import check_targets, split_handles
+from jaxdeform._checks import check_flag, check_precision, check_targets, check_type
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._handles.split import split_handles
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.cells import spokes
@@ -38,6 +39,7 @@ class LaplacianEditor(eqx.Module):
 
     def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
         """Return the edited positions, differentiable in the targets (handles, 3)."""
+        check_precision("this editor", np.dtype(self.rest.dtype))
         targets = check_targets(targets, len(self.handles), self.rest.dtype)
         x = self.rest.at[self.handles].set(targets).T.reshape(self.pull.shape)
         fixed = jnp.where(self.free[None], 0.0, x)
@@ -86,6 +88,8 @@ def laplacian_editor(
         >>> edit(mesh.vertices[[0, 1, 300, 721]] + 1.0).shape
         (722, 3)
     """
+    check_type("mesh", mesh, Mesh)
+    check_flag("similarity", similarity)
     n = mesh.n_vertices
     index, free, soft = split_handles(mesh, handles, handle_weights)
     cells = spokes(mesh, weights=weights)
@@ -119,7 +123,13 @@ def laplacian_editor(
 
 
 def laplacian_editing(
-    mesh: Mesh, handles: ArrayLike, targets: ArrayLike, **settings
+    mesh: Mesh,
+    handles: ArrayLike,
+    targets: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    handle_weights: ArrayLike = np.inf,
+    similarity: bool = False,
 ) -> Float[Array, "vertices 3"]:
     """Edit a mesh by its Laplacian coordinates, once. For many targets use laplacian_editor.
 
@@ -128,7 +138,7 @@ def laplacian_editing(
     - mesh: the rest shape.
     - handles: (handles,), vertex indices.
     - targets: (handles, 3), in the unit of the mesh.
-    - settings: those of :func:`laplacian_editor`.
+    - weights, handle_weights, similarity: as in :func:`laplacian_editor`.
 
     **Returns** the positions (vertices, 3).
 
@@ -142,7 +152,10 @@ def laplacian_editing(
         >>> jd.laplacian_editing(mesh, handles, mesh.vertices[handles]).shape
         (722, 3)
     """
-    return laplacian_editor(mesh, handles, **settings)(targets)
+    edit = laplacian_editor(
+        mesh, handles, weights=weights, handle_weights=handle_weights, similarity=similarity
+    )
+    return edit(targets)
 
 
 def _rotated_details(mesh: Mesh, laplacian: sp.csr_matrix) -> sp.csr_matrix:

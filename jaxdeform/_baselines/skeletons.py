@@ -2,11 +2,11 @@
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._checks import read_path
 from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.reading import read_text
 from jaxdeform._mesh.words import real, whole
@@ -52,7 +52,7 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
         >>> jd.load_skeleton(path)
         Skeleton(3 joints, 2 bones)
     """
-    path = Path(path)
+    path = read_path("path", path)
     if path.suffix.lower() != ".tgf":
         raise InputError(f"{path}: skeletons are .tgf files, not '{path.suffix}'")
     lines = read_text(path).splitlines()

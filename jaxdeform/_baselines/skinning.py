@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdeform._checks import as_array, check_positions, is_concrete, rows_of_three
+from jaxdeform._arrays import as_array, is_concrete
+from jaxdeform._checks import check_positions, rows_of_three
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.rotations import (
     matrices_from_quaternions,
@@ -37,13 +38,8 @@ def rigid_transforms(
         True
     """
     dtype = jnp.result_type(float)
-    rotations = as_array(rotations, dtype, "rotations")
-    if rotations.ndim != 2 or rotations.shape[1] != 3:
-        raise InputError(
-            f"rotations have shape {rotations.shape}: give (controls, 3) rotation vectors"
-        )
+    rotations = rows_of_three("rotations", rotations, dtype, unit="control")
     shape = rotations.shape
-    rotations = check_positions("rotations", rotations, shape, dtype, unit="control")
     translations = check_positions("translations", translations, shape, dtype, unit="control")
     centers = check_positions("centers", centers, shape, dtype, unit="control")
     matrices = rotation_matrices(rotations)

@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import (
-    as_array,
-    check_components,
-    check_groups,
     check_handles,
+    check_labels,
     check_positions,
-    is_concrete,
+    check_type,
     rows_of_three,
 )
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._handles.split import check_components
 from jaxdeform._mesh.mesh import Mesh
 
 
@@ -108,7 +108,8 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "ver
         >>> jd.geodesic_distances(jd.shapes.square(), [4])[0].round(6).tolist()
         [1.414214]
     """
-    index = check_handles(sources, mesh.n_vertices)
+    check_type("mesh", mesh, Mesh)
+    index = check_handles(sources, mesh.n_vertices, name="source")
     faces = np.ascontiguousarray(mesh.solid_faces)
     used = np.unique(faces)
     if not (igl.is_edge_manifold(faces)[0] and np.ravel(igl.is_vertex_manifold(faces))[used].all()):
@@ -157,8 +158,11 @@ def bounded_biharmonic_weights(
         >>> jd.bounded_biharmonic_weights(jd.shapes.bar(), [0, 721]).shape
         (722, 2)
     """
+    check_type("mesh", mesh, Mesh)
     index = check_handles(handles, mesh.n_vertices)
-    group = np.arange(len(index)) if group is None else check_groups(group, len(index))
+    count = len(index)
+    given = np.arange(count) if group is None else group
+    group = check_labels("group", given, count, "handle", count)
     count = int(group.max()) + 1
     empty = np.setdiff1d(np.arange(count), group)
     if empty.size:

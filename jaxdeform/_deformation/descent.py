@@ -1,9 +1,10 @@
 """What a solver and an adjoint are: the two protocols that ``deform`` is put together from."""
 
-from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int
 
+from jaxdeform._checks import check_setting
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._result import Result
@@ -17,6 +18,8 @@ class Descent(NamedTuple):
     """T_k of every cell at these positions, in its principal axes."""
     energy: Float[Array, "history"]
     """At the start and after each step; anything behind the last one."""
+    rounding: Float[Array, ""]
+    """How far the last energy may be off by rounding alone."""
     steps: Int[Array, ""]
     result: Result
 
@@ -67,3 +70,27 @@ class Solver(Protocol):
     ) -> Descent:
         """Iterate from a start, whose fixed vertices are on their targets."""
         ...
+
+
+def choose_adjoint(solver: Any, adjoint: Any) -> Adjoint:
+    """Return the adjoint, by default the solver's, or raise InputError: the two do not go together.
+
+    Also if one of them is no solver, or no adjoint.
+    """
+    check_setting(
+        "solver",
+        solver,
+        ("minimize", "default_adjoint", "can_unroll", "needs_one_energy"),
+        "jd.QuasiNewton() or jd.Alternating()",
+    )
+    if adjoint is None:
+        adjoint = solver.default_adjoint
+    else:
+        check_setting(
+            "adjoint",
+            adjoint,
+            ("solve", "check", "needs_one_energy"),
+            "jd.Implicit() or jd.Unrolled()",
+        )
+    adjoint.check(solver)
+    return adjoint

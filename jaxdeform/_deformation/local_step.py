@@ -23,25 +23,22 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from jaxdeform._deformation.cell_energy import cell_energy, half_hessian, half_hessian_product
+from jaxdeform._checks import check_count, check_tolerance
+from jaxdeform._deformation.cell_energy import cell_energies, cell_energy
 from jaxdeform._deformation.cell_newton import block_newton, exact_newton, gradient_tolerance
+from jaxdeform._deformation.material_derivative import material_with_derivative
 from jaxdeform._linalg.rotations import (
     polar_rotation,
     polar_rotation_of_grid,
     rotation_with_derivative,
 )
 from jaxdeform._linalg.small_matrices import (
-    Grid,
     Matrices,
     Scalars,
     Vectors,
     as_grid,
     from_grid,
-    ldl_factor,
-    ldl_solve,
-    minus_identity,
     product,
-    transpose,
 )
 from jaxdeform._linalg.subset import on_few
 
@@ -67,6 +64,13 @@ class LocalStep(Protocol):
         self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
     ) -> Matrices:
         """Return t, known to be ``minimize(c, b, rigidity)``, with the derivatives of that."""
+        ...
+
+    def energy(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Scalars:
+        """Return phi(t) of each cell, (cells,): what ``minimize`` minimises.
+
+        It holds the terms ``tr(T B T^T) - 2 tr(T C)`` of every cell, and the law's own.
+        """
         ...
 
 
@@ -103,11 +107,21 @@ def _over_batch(local: LocalStep):
 class _Material:
     """Solvers of Eq. 4.2 share the derivative of its solution."""
 
+    max_steps: int
+
+    def __post_init__(self) -> None:
+        """Check the setting."""
+        check_count(f"max_steps of {type(self).__name__}", self.max_steps)
+
     def with_implicit_derivative(
         self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
     ) -> Matrices:
         """Return t with the derivatives of the minimiser (implicit function theorem)."""
-        return _material_with_derivative(t, c, b, rigidity)
+        return material_with_derivative(t, c, b, rigidity)
+
+    def energy(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Scalars:
+        """Return Eq. 4.2 of each cell."""
+        return cell_energies(t, c, b, rigidity)
 
 
 @dataclass(frozen=True)
@@ -150,6 +164,11 @@ class LBFGS(_Material):
     tolerance: float = 1e-10
     """Stop at this gradient norm, relative to the cell's size (no less than 16 eps)."""
     max_steps: int = 200
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        check_tolerance("tolerance of LBFGS", self.tolerance)
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
         """Return the minimisers T (3, 3, n)."""
@@ -252,6 +271,10 @@ class RotationFit:
         del b, rigidity
         return rotation_with_derivative(t, c)
 
+    def energy(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Scalars:
+        """Return Eq. 4.2 of each cell; a rotation has no strain."""
+        return cell_energies(t, c, b, jnp.zeros_like(rigidity))
+
 
 @dataclass(frozen=True)
 class AffineFit:
@@ -274,55 +297,11 @@ class AffineFit:
         self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars
     ) -> Matrices:
         """Return t with the derivatives of the linear fit, those of lambda = 0."""
-        return _material_with_derivative(t, c, b, jnp.zeros_like(rigidity))
+        return material_with_derivative(t, c, b, jnp.zeros_like(rigidity))
 
-
-@jax.custom_jvp
-def _material_with_derivative(t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-    del c, b, rigidity
-    return t
-
-
-@_material_with_derivative.defjvp
-def _material_with_derivative_jvp(primals, tangents):
-    """Differentiate the condition grad phi(T) = 0 instead of the iterations.
-
-    ``H dT = dC^T - T dB - 2 (T T^T T - T) dlambda`` with H half the Hessian. A prototype that
-    differentiated the iterations took 40 s to compile.
-    """
-    t, c, b, rigidity = primals
-    t = _material_with_derivative(t, c, b, rigidity)  # so that this rule has derivatives too
-    _, dc, db, dlam = tangents
-    tg = as_grid(t)
-    gram = product(transpose(tg), tg)
-    excess = product(tg, minus_identity(gram))
-    right = [
-        [dc[j, i] - tg[i][j] * db[j] - 2.0 * excess[i][j] * dlam for j in range(3)]
-        for i in range(3)
-    ]
-    scale = rigidity + jnp.max(jnp.abs(b), axis=0)
-    floor = jnp.finfo(c.dtype).eps * scale + jnp.finfo(c.dtype).tiny
-    return t, _solve_hessian(tg, b, rigidity, floor, from_grid(right))
-
-
-def _solve_hessian(x: Grid, b: Vectors, rigidity: Scalars, floor: Scalars, right: Matrices):
-    """Solve H dT = right in every cell.
-
-    As a linear solve of its own, so that derivatives of second order solve again instead of
-    differentiating the 9x9 elimination. H is factored outside of it: what solves for many right
-    sides, as conjugate gradients do, factors once.
-    """
-    fixed = jax.lax.stop_gradient((x, list(b), rigidity, floor))
-    factor = ldl_factor(half_hessian(*fixed[:3]), fixed[3])
-
-    def apply(v: Matrices) -> Matrices:
-        return from_grid(half_hessian_product(x, list(b), rigidity, as_grid(v)))
-
-    def solve(_, r: Matrices) -> Matrices:
-        solution = ldl_solve(factor, [r[i, j] for i in range(3) for j in range(3)])
-        return from_grid([solution[3 * i : 3 * i + 3] for i in range(3)])
-
-    return jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)
+    def energy(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Scalars:
+        """Return Eq. 4.2 of each cell without resistance to strain."""
+        return cell_energies(t, c, b, jnp.zeros_like(rigidity))
 
 
 def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:

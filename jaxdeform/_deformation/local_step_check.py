@@ -6,6 +6,7 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 
+from jaxdeform._checks import check_setting
 from jaxdeform._deformation.local_step import (
     LBFGS,
     AffineFit,
@@ -20,25 +21,23 @@ _OURS = (Newton, LBFGS, GradientDescent, RotationFit, AffineFit)
 _METHODS = {
     "minimize": ("c", "b", "rigidity"),
     "with_implicit_derivative": ("t", "c", "b", "rigidity"),
+    "energy": ("t", "c", "b", "rigidity"),
 }
 
 
 def check_local_step(local: object) -> None:
     """Raise InputError unless this is a local step that can be called."""
+    if type(local) in _OURS:
+        return
     name = type(local).__name__
-    if isinstance(local, str):
-        raise InputError(
-            f"local is the text {local!r}: give a local step, such as jd.Newton(), or "
-            "jd.RotationFit() for ARAP"
-        )
-    if isinstance(local, type):
-        raise InputError(f"local is the class {local.__name__}: give {local.__name__}() instead")
+    check_setting(
+        "local",
+        local,
+        tuple(_METHODS),
+        "a local step, such as jd.Newton(), or jd.RotationFit() for ARAP, or one of your own (see "
+        "jd.LocalStep)",
+    )
     for method, names in _METHODS.items():
-        if not callable(getattr(local, method, None)):
-            raise InputError(
-                f"local is of type {name}, without the method {method}({', '.join(names)}): give "
-                "a local step, such as jd.Newton(), or one of your own (see jd.LocalStep)"
-            )
         try:
             inspect.signature(getattr(local, method)).bind(*names)
         except TypeError as error:
@@ -46,13 +45,6 @@ def check_local_step(local: object) -> None:
                 f"{name}.{method} cannot be called with ({', '.join(names)}): {error}; see "
                 "jd.LocalStep"
             ) from error
-    try:
-        hash(local)
-    except TypeError as error:
-        raise InputError(
-            f"local of type {name} is not hashable, so compiled code cannot be kept for it: make "
-            "it a frozen dataclass with numbers for fields"
-        ) from error
     if not isinstance(local, _OURS):
         _check_what_it_returns(local, jnp.result_type(float))
 
@@ -60,11 +52,12 @@ def check_local_step(local: object) -> None:
 @cache
 def _check_what_it_returns(local: LocalStep, dtype) -> None:
     c, b, rigidity = (jax.ShapeDtypeStruct((*axes, 5), dtype) for axes in ((3, 3), (3,), ()))
-    for method, given in zip(_METHODS, ((c, b, rigidity), (c, c, b, rigidity)), strict=True):
-        out = jax.eval_shape(getattr(local, method), *given)
-        shape, kind = getattr(out, "shape", None), getattr(out, "dtype", None)
-        if shape != c.shape or kind != dtype:
+    known = {"c": c, "t": c, "b": b, "rigidity": rigidity}
+    for method, names in _METHODS.items():
+        out = jax.eval_shape(getattr(local, method), *(known[name] for name in names))
+        wanted = (5,) if method == "energy" else c.shape
+        if getattr(out, "shape", None) != wanted or getattr(out, "dtype", None) != dtype:
             raise InputError(
                 f"{type(local).__name__}.{method} returned {out} for 5 cells of {dtype}: return "
-                f"one array of shape (3, 3, 5) and that type, the cells on the last axis"
+                f"one array of shape {wanted} and that type, the cells on the last axis"
             )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,15 +11,20 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._checks import HandleSplit, check_rigidity, split_handles
+from jaxdeform._checks import check_precision, check_rigidity, check_type
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_map, stiffness
 from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, shown
+from jaxdeform._handles.split import HandleSplit, split_handles
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._mesh.bounded import bounded_cells
 from jaxdeform._mesh.cells import Cells, principal_moments, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
+
+# Further from the origin, in diagonals, float32 keeps fewer than four digits of a position.
+_FAR_IN_FLOAT32 = 1e3
 
 
 class System(eqx.Module):
@@ -40,6 +46,17 @@ class System(eqx.Module):
     initial_guess: LaplacianGuess
     faces: Int[Array, "faces 3"]
 
+    def held(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+        """Return x at the vertices that are not free, 0 elsewhere.
+
+        Added to a Hessian, which is 0 there, it makes the system regular.
+        """
+        return jnp.where(self.free[None], 0.0, x)
+
+    def precondition(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+        """Return A^-1 x at free vertices, x at others."""
+        return self.factor.solve(x) + self.held(x)
+
 
 class Problem(eqx.Module):
     """A mesh with its cells and handles, factored. Made by :func:`precompute`.
@@ -54,7 +71,7 @@ class Problem(eqx.Module):
     handles: Int[np.ndarray | Array, "handles"]
     """Indices of the handle vertices, in the order of the targets' rows."""
     cells: Cells = eqx.field(static=True)
-    """The cells, as they were given (:func:`rings` with r = 1 by default)."""
+    """The cells (:func:`rings` with r = 1 by default), with the weights that are computed with."""
 
     @property
     def mesh(self) -> Mesh:
@@ -107,8 +124,9 @@ def precompute(
     **Raises** InputError: no handles; an index out of range or repeated; a connected component of
     the mesh without a handle (it could lie anywhere); cells of another mesh.
 
-    Unreferenced vertices stay where they are. Where negative cotangent weights make A indefinite,
-    they are lifted to 1e-3 of the mean weight, with a warning.
+    Unreferenced vertices stay where they are. Where negative weights leave the energy of a cell
+    without a lower bound, they count as 0, with a warning that names the cells. So the energy has a
+    lower bound for every rigidity >= 0.
 
     Example:
         >>> import jaxdeform as jd
@@ -118,16 +136,25 @@ def precompute(
         >>> jd.precompute(mesh, handles).n_vertices
         722
     """
+    check_type("mesh", mesh, Mesh)
     split = split_handles(mesh, handles, handle_weights)
     cells = rings(mesh, 1) if cells is None else cells
+    check_type("cells", cells, Cells)
     if cells.mesh != mesh:
         raise InputError(
             f"cells are of another mesh ({cells.mesh}, not equal to this {mesh}): call "
             "rings(mesh, r) on this mesh"
         )
     dtype = _checked_dtype(dtype)
-    center = mesh.vertices[mesh.referenced].mean(axis=0)
+    center = mesh.center
     rest = mesh.vertices - center
+    if dtype == np.float32 and np.abs(center).max() > _FAR_IN_FLOAT32 * mesh.diagonal:
+        warnings.warn(
+            f"the mesh lies {np.abs(center).max() / mesh.diagonal:.0f} diagonals from the origin: "
+            "it is deformed about its own centre, but the positions that come back are rounded to "
+            "float32. Move it to the origin, or use float64.",
+            stacklevel=2,
+        )
     used, matrix, factor = _factorise(cells, rest, split, dtype)
     moments, axes = principal_moments(used)
     put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
@@ -144,11 +171,14 @@ def precompute(
         initial_guess=laplacian_guess(used, split.free & (split.soft == 0), dtype),
         faces=jax.device_put(mesh.faces.astype(np.int32)),
     )
-    return Problem(system, split.index, cells)
+    return Problem(system, split.index, used)
 
 
-def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
-    kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
+def _checked_dtype(dtype: Any) -> np.dtype:
+    try:
+        kind = np.dtype(dtype if dtype is not None else jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise InputError(f"dtype is {shown(dtype)}: use float32 or float64") from None
     if kind not in (np.float32, np.float64):
         raise InputError(f"dtype {kind} is not supported: use float32 or float64")
     if kind == np.float64 and not jax.config.read("jax_enable_x64"):
@@ -161,16 +191,26 @@ def _checked_dtype(dtype: np.dtype | type | None) -> np.dtype:
 def _factorise(
     cells: Cells, rest: Float[np.ndarray, "vertices 3"], split: HandleSplit, dtype: np.dtype
 ) -> tuple[Cells, sp.spmatrix, Factor]:
-    """Factor A, with lifted weights if it is indefinite with those of the cells."""
-    matrix = stiffness(cells) + sp.diags(split.soft)
+    """Factor A of cells whose energy has a lower bound, and return those cells."""
+    used, bad = bounded_cells(cells)
+    if bad.size:
+        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
+        warnings.warn(
+            f"negative weights (obtuse angles) leave the energy of {len(bad)} cells without a "
+            f"lower bound (cells {shown}): {int((used.weights != cells.weights).sum())} edge "
+            "weights count as 0 there. Pass weights of your own, none negative, to decide "
+            "otherwise.",
+            stacklevel=3,
+        )
+    matrix = stiffness(used) + sp.diags(split.soft)
     try:
-        return cells, matrix, factorise(matrix, split.free, dtype, positions=rest)
+        return used, matrix, factorise(matrix, split.free, dtype, positions=rest)
     except NotPositiveDefinite:
         pass
-    lifted = lifted_weights(cells.weights)
-    raised = int((lifted > cells.weights).sum())
-    cells = dataclasses.replace(cells, weights=lifted)
-    matrix = stiffness(cells) + sp.diags(split.soft)
+    lifted = lifted_weights(used.weights)
+    raised = int((lifted > used.weights).sum())
+    used = dataclasses.replace(used, weights=lifted)
+    matrix = stiffness(used) + sp.diags(split.soft)
     try:
         factor = factorise(matrix, split.free, dtype, positions=rest)
     except NotPositiveDefinite as error:
@@ -179,12 +219,17 @@ def _factorise(
             "spans too many orders of magnitude; see jd.inspect(mesh) and jd.repair(mesh)"
         ) from error
     warnings.warn(
-        f"negative or zero weights made the system indefinite: {raised} edge weights were lifted "
-        f"to {lifted.min():.3g}. Pass weights of your own to rings() or spokes() to decide "
-        "otherwise.",
+        f"weights of 0 made the system singular: {raised} edge weights were lifted to "
+        f"{lifted.min():.3g}. Pass weights of your own to rings() or spokes() to decide otherwise.",
         stacklevel=3,
     )
-    return cells, matrix, factor
+    return used, matrix, factor
+
+
+def check_problem(problem: Any) -> None:
+    """Raise InputError unless this is a problem, of a type that JAX can compute in now."""
+    check_type("problem", problem, Problem)
+    check_precision("problem", problem.dtype)
 
 
 def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:
@@ -204,6 +249,7 @@ def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array
         >>> jd.rigidity_from_material(problem, 0.2).shape
         (722,)
     """
+    check_problem(problem)
     constant = check_rigidity(constant, problem.n_vertices, problem.dtype, name="constant")
     trace = jnp.sum(problem.system.principal_moments, axis=0)
     return jnp.asarray(constant) * jnp.maximum(trace, 0.0) / 2.0

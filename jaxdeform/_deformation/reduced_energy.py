@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdeform._deformation.energy import local_energy
+from jaxdeform._deformation.geometry import Geometry, GeometryMaps
 from jaxdeform._deformation.local_step import LocalStep, solve_local_step
 from jaxdeform._deformation.problem import System
 from jaxdeform._linalg.ell import split_batch
@@ -27,6 +27,8 @@ class Inputs(NamedTuple):
     rigidity: Float[Array, "*vertices"]
     soft: Float[Array, "*vertices"]
     """Weights of the soft handles; by default those of the system, which its factor holds."""
+    geometry: Geometry | None = None
+    """The rest shape and the edge weights, where derivatives to them are asked for."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +56,28 @@ class ReducedEnergy:
             jnp.repeat(x, size, axis=-1)
             for x in (system.principal_moments, system.free, system.soft)
         )
-        c = system.covariance(p, size)
+        at = None if inputs.geometry is None else GeometryMaps(system, inputs.geometry)
+        maps = at or system
+        c = maps.covariance(p, size)
         if self.normals:
             t, cells = self._fit_with_normals(system, inputs, p, c, transforms)
-        else:
+        elif at is None:
             t = self._fit(transforms, c, moments, inputs.rigidity)
-            cells = local_energy(t, c, moments, inputs.rigidity, batch)
+            cells = self.local.energy(t, c, moments, inputs.rigidity)
+        else:
+            # B enters a law as T B only, so its change acts like one of C.
+            change = at.moment_change()
+            push = jnp.einsum("jik,lik->jlk", change, jax.lax.stop_gradient(transforms))
+            t = self._fit(transforms, c - push, moments, inputs.rigidity)
+            cells = self.local.energy(t, c, moments, inputs.rigidity)
+            cells += jnp.einsum("ijk,jlk,ilk->k", t, change, t)
         # The factor holds the system's own weights of soft handles. Other weights enter here only.
-        stiff = system.stiffness.apply(p, size) + (inputs.soft - soft)[None] * p
-        pull = system.covariance.transpose(t, size) + inputs.soft[None] * inputs.targets
+        stiff = maps.stiffness.apply(p, size) + (inputs.soft - soft)[None] * p
+        pull = maps.covariance.transpose(t, size) + inputs.soft[None] * inputs.targets
         scale = total(p * stiff, batch)
         # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
         springs = inputs.soft[None] * inputs.targets * (inputs.targets - 2.0 * p)
-        energy = scale + total(springs, batch) + cells
+        energy = scale + total(springs, batch) + total(cells, batch)
         gradient = jnp.where(free[None], stiff - pull, 0.0)
         # The energy is a small difference of terms as large as scale, hence its rounding error.
         rounding = 20.0 * jnp.finfo(p.dtype).eps * jnp.abs(scale)
@@ -108,7 +119,7 @@ class ReducedEnergy:
             transforms = einsum("cak,abk->cbk", transforms, rotation)
         t = self._fit(transforms, c, moments, inputs.rigidity)
         has_normal = jnp.sum(normal * normal, axis=0)
-        cells = local_energy(t, c, moments, inputs.rigidity) + jnp.sum(has_normal)
+        cells = self.local.energy(t, c, moments, inputs.rigidity) + has_normal
         return einsum("cbk,abk->cak", t, rotation), cells
 
 

@@ -7,24 +7,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import (
-    as_array,
+    check_flag,
     check_positions,
     check_rigidity,
-    check_targets,
-    is_concrete,
+    read_host_positions,
     read_positions,
 )
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.descent import Adjoint, Solver
-from jaxdeform._deformation.energy import local_energy
+from jaxdeform._deformation.cell_energy import cell_energies
+from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
+from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.local_step_check import check_local_step
-from jaxdeform._deformation.problem import Problem, System
+from jaxdeform._deformation.problem import Problem, System, check_problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.verdict import inside_out, verdict
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._result import Result, succeeded
 
@@ -42,6 +45,8 @@ class Solution(eqx.Module):
     """Iterations done."""
     result: Result
     """What happened: a member of :class:`Result`."""
+    flipped: Int[Array, "*batch"]
+    """Number of cells that are inside out (det T <= 0): a part of the mesh is its mirror image."""
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:
@@ -49,14 +54,20 @@ class Solution(eqx.Module):
         return succeeded(self.result)
 
     def explain(self) -> str:
-        """Return what happened in words, with the first cells that have no finite transformation.
+        """Return what happened in words, and name the first cells that are not as they should be.
 
         Of one solution, not of a batch, and once the values are known.
         """
-        bad = np.flatnonzero(~np.isfinite(np.asarray(self.transforms)).all(axis=(1, 2)))
-        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
-        where = f" Cells at fault: {shown} ({len(bad)} of {len(self.transforms)})."
-        return Result[self.result] + (where if bad.size else "")
+        t = np.asarray(self.transforms)
+        finite = np.isfinite(t).all(axis=(1, 2))
+        orientation = np.einsum("ki,ki->k", t[:, 0], np.cross(t[:, 1], t[:, 2]))
+        flipped = finite & (orientation <= 0)
+        text = Result[self.result]
+        for what, bad in (("at fault", ~finite), ("inside out (det T <= 0)", flipped)):
+            at = np.flatnonzero(bad)
+            shown = ", ".join(map(str, at[:5])) + (", ..." if len(at) > 5 else "")
+            text += f" Cells {what}: {shown} ({len(at)} of {len(t)})." if at.size else ""
+        return text
 
 
 def deform(
@@ -70,11 +81,15 @@ def deform(
     handle_weights: ArrayLike | None = None,
     normals: bool = False,
     adjoint: Adjoint | None = None,
+    rest: ArrayLike | None = None,
+    edge_weights: ArrayLike | None = None,
+    throw: bool = False,
 ) -> Solution:
     """Deform the mesh so that its handles reach their targets and the rest follows (Eq. 4.4).
 
     A pure function of arrays: it works under jit, vmap (over targets, rigidity, start), grad, jvp
-    and, with the implicit derivative, hessian (to targets, rigidity and handle_weights).
+    and hessian (to targets, rigidity, handle_weights, and to rest and edge_weights). What has no
+    derivative, such as the arrays of the problem, raises instead of giving 0.
 
     **Arguments**
 
@@ -95,12 +110,18 @@ def deform(
     - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
       (the only one of QuasiNewton).
+    - rest: (vertices, 3), the problem's own rest positions, given to be differentiated in: the
+      derivative is that of ``precompute`` and ``deform`` together. With ``Implicit()`` only.
+    - edge_weights: (edges,), the problem's own edge weights, likewise. Without them the derivative
+      to ``rest`` includes that of the cotangent weights.
+    - throw: raise an error if the result is not ``ok``, also inside jit. By default numerical
+      trouble comes back in ``result``, because one bad member of a batch must not end the others.
 
     **Returns** a :class:`Solution`. Numerical trouble comes back in its ``result``.
 
     **Raises** InputError: targets or start of the wrong shape or not finite; rigidity negative,
     not finite or of the wrong length; settings that exclude each other. Shapes are checked always,
-    values where they are known (they are not while JAX traces).
+    values where they are known. While JAX traces they are not: then ``result`` is ``bad_input``.
 
     Example:
         >>> import jaxdeform as jd
@@ -112,10 +133,12 @@ def deform(
         >>> out.vertices.shape
         (722, 3)
     """
+    check_problem(problem)
+    check_flag("normals", normals)
+    check_flag("throw", throw)
     if solver is None:
         solver = Alternating() if normals else QuasiNewton()
-    adjoint = adjoint or solver.default_adjoint
-    adjoint.check(solver)
+    adjoint = choose_adjoint(solver, adjoint)
     if normals and (solver.needs_one_energy or adjoint.needs_one_energy):
         raise InputError(
             "with normals the iteration is not the descent of one energy (n' lags behind): use "
@@ -123,13 +146,23 @@ def deform(
         )
     check_local_step(local)
     count, dtype = problem.n_vertices, problem.dtype
-    targets = check_targets(targets, len(problem.handles), dtype)
     rigidity = check_rigidity(rigidity, count, dtype)
+    relative = _from_center(problem, "targets", targets, len(problem.handles), "handle")
     if start is not None:
-        start = read_positions("start", start, (count, 3), dtype)
-    spread = _spread_targets(problem, targets), rigidity, _spread_weights(problem, handle_weights)
-    inputs = Inputs(*(cast(Array, x) for x in spread))  # JAX's arrays once they are inside
-    return _solve(problem.system, inputs, start, ReducedEnergy(local, normals), solver, adjoint)
+        start = _from_center(problem, "start", start, count, "vertex")
+    spread = _spread_targets(problem, relative)
+    soft = _spread_weights(problem, handle_weights)
+    # NumPy's arrays are JAX's once they are inside.
+    inputs = Inputs(cast(Array, spread), cast(Array, rigidity), soft)
+    if rest is not None or edge_weights is not None:
+        inputs = inputs._replace(geometry=read_geometry(problem, rest, edge_weights))
+        if not adjoint.needs_one_energy:
+            raise InputError(
+                "rest and edge_weights are differentiated by Implicit() only: give "
+                "adjoint=jd.Implicit()"
+            )
+    out = _solve(problem.system, inputs, start, ReducedEnergy(local, normals), solver, adjoint)
+    return out.result.error_if(out, ~out.ok) if throw else out
 
 
 def energy(
@@ -148,18 +181,39 @@ def energy(
         >>> bool(abs(jd.energy(problem, mesh.vertices, rest, 1.0)) < 1e-2)
         True
     """
+    check_problem(problem)
     count, dtype, system = problem.n_vertices, problem.dtype, problem.system
     p = check_positions("vertices", vertices, (count, 3), dtype).T - system.center[:, None]
     t = check_positions("transforms", transforms, (count, 3, 3), dtype)
     lam = jnp.asarray(check_rigidity(rigidity, count, dtype))
     t = jnp.einsum("kai,ijk->ajk", t, system.principal_axes, precision="highest")
     stiff = system.stiffness.apply(p) - system.soft[None] * p
-    cells = local_energy(t, system.covariance(p), system.principal_moments, lam)
-    return jnp.sum(p * stiff) + cells
+    cells = cell_energies(t, system.covariance(p), system.principal_moments, lam)
+    return jnp.sum(p * stiff) + jnp.sum(cells)
+
+
+def _from_center(
+    problem: Problem, name: str, value: ArrayLike, rows: int, unit: str
+) -> Float[Array, "3 rows"] | Float[np.ndarray, "3 rows"]:
+    """Read positions (rows, 3) relative to the centre of the rest shape.
+
+    Known values are subtracted in float64, so that a float32 problem far from the origin loses no
+    digit of where its handles go.
+    """
+    if isinstance(value, Array) and not is_concrete(value):
+        given = read_positions(name, value, (rows, 3), problem.dtype, unit)
+        return jnp.asarray(given - problem.system.center[None]).T
+    given = read_host_positions(name, value, (rows, 3), unit) - problem.mesh.center
+    with np.errstate(over="ignore"):
+        given = given.T.astype(problem.dtype)
+    if not np.isfinite(given).all():
+        raise InputError(f"{name} are too large for {problem.dtype}: use another unit of length")
+    return given
 
 
 def _spread_targets(
-    problem: Problem, targets: Array | np.ndarray
+    problem: Problem,
+    targets: Float[Array, "3 handles"] | Float[np.ndarray, "3 handles"],
 ) -> Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"]:
     """Spread the targets over an array of all vertices, in NumPy where they are known.
 
@@ -167,11 +221,11 @@ def _spread_targets(
     not compile anything anew.
     """
     system, handles = problem.system, problem.handles
-    if all(map(is_concrete, (targets, system.center, system.rest, handles))):
+    if all(map(is_concrete, (targets, system.rest, handles))):
         spread = np.array(system.rest)
-        spread[:, np.asarray(handles)] = (np.asarray(targets) - np.asarray(system.center)).T
+        spread[:, np.asarray(handles)] = targets
         return spread
-    return system.rest.at[:, handles].set((targets - system.center[None]).T)
+    return system.rest.at[:, handles].set(targets)
 
 
 def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "vertices"]:
@@ -202,11 +256,12 @@ def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array,
 def _solve(
     system: System,
     inputs: Inputs,
-    start: Float[Array, "vertices 3"] | Float[np.ndarray, "vertices 3"] | None,
+    start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
     energy: ReducedEnergy,
     solver: Solver,
     adjoint: Adjoint,
 ) -> Solution:
+    system = _without_derivative(system)
     p = _first_positions(system, inputs, start)
     end = adjoint.solve(solver, energy, system, inputs, p)
     p, steps = end.positions, end.steps
@@ -214,7 +269,6 @@ def _solve(
         energy, system, inputs, p, end.transforms, end.energy[steps]
     )
     after = jnp.arange(end.energy.shape[0], dtype=steps.dtype) >= steps
-    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(p))
     return Solution(
         vertices=(p + system.center[:, None]).T,
         transforms=jnp.einsum(
@@ -222,8 +276,25 @@ def _solve(
         ),
         energy=jnp.where(after, value, end.energy),
         steps=steps,
-        result=Result.where(finite, end.result, Result.not_finite),
+        result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
+        flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
     )
+
+
+@partial(jax.custom_jvp)
+def _without_derivative(system: System) -> System:
+    """Return the system, which refuses to be differentiated in."""
+    return system
+
+
+@partial(_without_derivative.defjvp, symbolic_zeros=True)
+def _without_derivative_jvp(primals, tangents):
+    if not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents)):
+        raise InputError(
+            "the arrays of a Problem have no derivative here: differentiate in rest= and "
+            "edge_weights= of deform, in targets, rigidity or handle_weights"
+        )
+    return primals[0], tangents[0]
 
 
 def _first_positions(system: System, inputs: Inputs, start) -> Float[Array, "3 vertices"]:
@@ -233,7 +304,7 @@ def _first_positions(system: System, inputs: Inputs, start) -> Float[Array, "3 v
         displacement = jnp.where(led[None], inputs.targets - system.rest, 0.0)
         p = system.rest + system.initial_guess(displacement)
     else:
-        p = start.T - system.center[:, None]
+        p = start
     return jnp.where(system.free[None], p, inputs.targets)
 
 

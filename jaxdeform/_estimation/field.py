@@ -15,10 +15,11 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
 
-from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._checks import check_count, check_function, check_tolerance
+from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
 from jaxdeform._estimation.noise import NORMAL_95
 from jaxdeform._estimation.poses import (
@@ -111,17 +112,16 @@ def estimate_rigidity_field(
         >>> jd.estimate_rigidity_field(problem, pose).field.shape
         (9,)
     """
-    if not (np.isfinite(smoothness) and smoothness > 0):
-        raise InputError(
-            f"smoothness is {smoothness}: give a number above 0, without it vertices that the "
-            "poses say nothing about have no value"
-        )
+    # Without smoothness, vertices that the poses say nothing about would have no value.
+    check_tolerance("smoothness", smoothness, positive=True)
+    check_count("max_evaluations", max_evaluations)
+    check_function("progress", progress, "evaluation, misfit, rigidity")
     poses = check_poses(problem, observed, targets, mask)
-    adjoint = adjoint or solver.default_adjoint
+    adjoint = choose_adjoint(solver, adjoint)
     size = _sizes(problem)
     bounds = log_bounds(size).astype(problem.dtype)
     medium = np.full(len(size), 0.1 * np.median(size))
-    theta = np.clip(np.log(check_start(start, medium)), *bounds)
+    theta = np.clip(np.log(check_start(start, medium, "vertex")), *bounds)
     prior = _prior(problem)
     history: list[float] = []
 

@@ -71,7 +71,7 @@ class PartModel:
 
     def start(self, given) -> Float[np.ndarray, "parts"]:
         """Return the log rigidity to start from: that given, or a medium material."""
-        return np.clip(np.log(check_start(given, 0.1 * self.size)), *self.bounds)
+        return np.clip(np.log(check_start(given, 0.1 * self.size, "part")), *self.bounds)
 
     def field(self, theta: np.ndarray) -> Float[np.ndarray, "vertices"]:
         """Return the rigidity of each vertex."""

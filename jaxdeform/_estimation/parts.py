@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._checks import check_count, check_function, check_labels, check_tolerance
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.descent import Adjoint, Solver
+from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.bounded_gauss_newton import box_solver
@@ -107,7 +108,8 @@ def estimate_rigidity(
     **Returns** an :class:`Estimate`.
 
     **Raises** InputError: shapes that do not fit; positions that are seen and not finite; a handle
-    that was not seen, without targets; parts with gaps.
+    that was not seen, without targets; parts with gaps; nothing to observe, because every vertex is
+    a handle or masked; settings out of range.
 
     Example:
         >>> import jaxdeform as jd
@@ -119,10 +121,13 @@ def estimate_rigidity(
         >>> fit.verdict
         ('determined',)
     """
-    n = problem.n_vertices
     poses = check_poses(problem, observed, targets, mask)
+    n = problem.n_vertices
     label = check_parts(np.zeros(n, int) if parts is None else parts, n)
-    adjoint = adjoint or solver.default_adjoint
+    adjoint = choose_adjoint(solver, adjoint)
+    check_tolerance("displacement_tolerance", displacement_tolerance)
+    check_count("max_evaluations", max_evaluations)
+    check_function("progress", progress, "evaluation, misfit, rigidity")
     model = PartModel.build(problem, poses, label, solver, adjoint)
     found = _search_parts(model, model.start(start), targets is None, max_evaluations, progress)
     best = found.best
@@ -174,15 +179,7 @@ def _search_parts(model: PartModel, theta, noisy_handles: bool, limit: int, prog
 
 def check_parts(parts: ArrayLike, n: int) -> Int[np.ndarray, "vertices"]:
     """Return the part of each vertex, or raise InputError naming what is wrong."""
-    label = np.asarray(parts)
-    if label.shape != (n,) or label.dtype.kind not in "iu":
-        raise InputError(
-            f"parts have shape {label.shape} and type {label.dtype}: give one integer per vertex, "
-            f"({n},)"
-        )
-    if label.min() < 0:
-        k = int(label.argmin())
-        raise InputError(f"the part of vertex {k} is {label[k]}: number the parts from 0")
+    label = check_labels("parts", parts, n, "vertex", n)
     missing = np.setdiff1d(np.arange(label.max() + 1), label)
     if missing.size:
         raise InputError(

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdeform._checks import as_array, check_positions, check_rigidity
-from jaxdeform._deformation.problem import Problem
+from jaxdeform._arrays import read_host_array, read_numbers
+from jaxdeform._checks import check_rigidity, read_positions
+from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import InputError
 
@@ -86,18 +87,11 @@ def residual_of(poses: Poses, vertices) -> Float[Array, "poses vertices 3"]:
 # ---------------------------------------------------------------- checks
 
 
-def check_poses(problem: Problem, observed: Any, targets: Any, mask: Any) -> Poses:
+def check_poses(problem: Any, observed: Any, targets: Any, mask: Any) -> Poses:
     """Return the poses, or raise InputError naming what is wrong."""
-    n = problem.n_vertices
-    given = np.asarray(as_array(observed, problem.dtype, "observed"))
-    if given.ndim == 2:
-        given = given[None]
-    if given.ndim != 3 or given.shape[1:] != (n, 3) or not len(given):
-        raise InputError(
-            f"observed has shape {np.shape(observed)}: give one pose ({n}, 3) or several "
-            f"(poses, {n}, 3) of the same mesh as the rest shape"
-        )
-    seen = _check_mask(mask, len(given), n)
+    check_problem(problem)
+    given = read_poses("observed", observed, problem.n_vertices, problem.dtype)
+    seen = _check_mask(mask, *given.shape[:2])
     bad = np.argwhere(seen & ~np.isfinite(given).all(axis=2))
     if len(bad):
         pose, vertex = bad[0]
@@ -106,12 +100,33 @@ def check_poses(problem: Problem, observed: Any, targets: Any, mask: Any) -> Pos
             f"({len(bad)} such): mark what was not seen with mask"
         )
     goal = _check_targets(problem, targets, given, seen)
-    counted = seen & np.asarray(problem.system.free)
+    free = np.asarray(problem.system.free)
+    counted = seen & free
+    if not counted.any():
+        move = "observe one that is free (mask)" if free.any() else "leave some out of the handles"
+        raise InputError(
+            "nothing is free to observe: every vertex is fixed by a handle or was not seen, so the "
+            f"poses do not depend on the rigidity; {move}"
+        )
     return Poses(goal, np.where(counted[..., None], given, 0.0).astype(problem.dtype), counted)
 
 
+def read_poses(
+    name: str, value: Any, n: int, dtype: np.dtype
+) -> Float[np.ndarray, "poses vertices 3"]:
+    """Return one pose or several, finite or not, or raise InputError naming what is wrong."""
+    array = read_host_array(value, dtype, name)
+    poses = array[None] if array.ndim == 2 else array
+    if poses.ndim != 3 or poses.shape[1:] != (n, 3) or not len(poses):
+        raise InputError(
+            f"{name} has shape {array.shape}: give one pose ({n}, 3) or several (poses, {n}, 3) of "
+            "the same mesh as the rest shape"
+        )
+    return poses
+
+
 def _check_mask(mask: Any, poses: int, n: int) -> Bool[np.ndarray, "poses vertices"]:
-    seen = np.ones((poses, n), bool) if mask is None else np.asarray(mask)
+    seen = np.ones((poses, n), bool) if mask is None else read_numbers(mask, "mask")
     if seen.dtype != bool or seen.shape not in ((n,), (poses, n)):
         raise InputError(
             f"mask has shape {seen.shape} and type {seen.dtype}: give booleans ({n},) or "
@@ -132,17 +147,19 @@ def _check_targets(problem, targets, given, seen) -> Float[np.ndarray, "poses ha
                 "it out of the handles"
             )
         return given[:, handles]
-    goal = np.asarray(as_array(targets, dtype, "targets"))
+    goal = read_host_array(targets, dtype, "targets")
     goal = goal[None] if goal.ndim == 2 else goal
     shape = (len(given), len(handles), 3)
-    return np.asarray(check_positions("targets", goal, shape, dtype, unit="pose"))
+    return np.asarray(read_positions("targets", goal, shape, dtype, unit="pose"))
 
 
-def check_start(start: Any, default: np.ndarray) -> Float[np.ndarray, "unknowns"]:
+def check_start(start: Any, default: np.ndarray, unit: str) -> Float[np.ndarray, "unknowns"]:
     """Return the rigidities to start from, or raise InputError naming what is wrong."""
     if start is None:
         return default
-    values = np.asarray(check_rigidity(start, len(default), np.dtype(float), name="start"))
+    given = read_host_array(start, np.float64, "start")
+    count = len(default)
+    values = np.asarray(check_rigidity(given, count, given.dtype, name="start", unit=unit))
     if (values <= 0).any():
         raise InputError("start must be above 0, because the search runs on its logarithm")
     return values

@@ -6,7 +6,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._checks import check_tolerance, check_type
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._estimation.poses import read_poses
 from jaxdeform._mesh.mesh import Mesh
 
 # Rounds of growing and fitting again. Real meshes need 3 to 8.
@@ -81,12 +83,10 @@ def find_handle_groups(
         >>> len(group.vertices), group.degrees.round(6)
         (722, array([0.]))
     """
+    check_type("mesh", mesh, Mesh)
     n = mesh.n_vertices
     poses = _check_deformed(deformed, n)
-    if not tolerance > 0:
-        raise InputError(
-            f"tolerance {tolerance}: give a fraction of the diagonal above 0, such as 1e-6"
-        )
+    check_tolerance("tolerance", tolerance, positive=True)
     reach = tolerance * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     i, j = mesh.edges.T
     ones = np.ones(len(i), np.int8)
@@ -116,17 +116,11 @@ def find_handle_groups(
 
 
 def _check_deformed(deformed: ArrayLike, n: int) -> Float[np.ndarray, "poses vertices 3"]:
-    poses = np.asarray(deformed, np.float64)
-    poses = poses[None] if poses.ndim == 2 else poses
-    if poses.ndim != 3 or poses.shape[1:] != (n, 3) or not len(poses):
-        raise InputError(
-            f"deformed has shape {np.shape(deformed)}: give ({n}, 3) or (poses, {n}, 3), the same "
-            "vertices as the mesh"
-        )
+    poses = read_poses("deformed", deformed, n, np.dtype(np.float64))
     bad = np.argwhere(~np.isfinite(poses).all(axis=2))
     if len(bad):
         raise InputError(
-            f"vertex {bad[0][1]} of pose {bad[0][0]} is not finite: give real positions"
+            f"deformed: vertex {bad[0][1]} of pose {bad[0][0]} is not finite: give real positions"
         )
     return poses
 

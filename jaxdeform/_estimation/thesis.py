@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.alternating import Alternating
-from jaxdeform._deformation.descent import Solver
+from jaxdeform._deformation.descent import Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import ArrayLike, InputError
@@ -58,7 +59,15 @@ def estimate_rigidity_thesis(
     """
     poses = check_poses(problem, observed, targets, None)
     if len(poses.targets) != 1:
-        raise InputError("Algorithm 1 takes one pose: call it for each, and take the largest")
+        raise InputError(
+            f"observed holds {len(poses.targets)} poses, but Algorithm 1 takes one: call it for "
+            "each, and take the largest"
+        )
+    check_tolerance("step_size", step_size, positive=True)
+    check_tolerance("threshold", threshold)
+    check_tolerance("start", start, positive=True)
+    check_count("max_evaluations", max_evaluations)
+    choose_adjoint(solver, None)
     rigidity, path, history = float(start), [], []
     for _ in range(max_evaluations):
         vertices = deform(problem, poses.targets[0], rigidity, solver=solver).vertices

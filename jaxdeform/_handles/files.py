@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxdeform._checks import check_handles
+from jaxdeform._checks import check_handles, check_type, read_path
 from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.reading import read_json, read_text
@@ -56,10 +56,12 @@ def load_handles(
         >>> jd.load_handles(path, jd.shapes.bar()).handles
         array([0, 1])
     """
-    path = Path(path)
+    path = read_path("path", path)
+    check_type("mesh", mesh, Mesh)
+    motion = None if motion is None else read_path("motion", motion)
     suffix = path.suffix.lower()
     if suffix == ".sel":
-        beside = path.with_suffix(".def") if motion is None else Path(motion)
+        beside = path.with_suffix(".def") if motion is None else motion
         handles, targets = _parse_survey(path, beside, mesh)
     elif suffix != ".json":
         raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
@@ -87,7 +89,7 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         _check_keys(where, group, "vertices", "rotation", "translation", "targets", "name")
         try:
             index = check_handles(group["vertices"], mesh.n_vertices)
-        except (InputError, ValueError) as error:
+        except InputError as error:
             raise InputError(f"{where}: {error}") from error
         handles.append(index)
         targets.append(_moved(where, group, mesh.vertices[index]))

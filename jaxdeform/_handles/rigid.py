@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdeform._checks import as_array, check_groups, check_positions
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._arrays import float_type
+from jaxdeform._checks import check_labels, check_positions, rows_of_three
+from jaxdeform._errors import ArrayLike
 from jaxdeform._linalg.rotations import rotation_matrices
 
 
@@ -43,26 +44,13 @@ def rigid_targets(
         >>> np.allclose(moved, [[0.0, 1.0, 5.0], [0.0, -1.0, 5.0]], atol=1e-6)
         True
     """
-    points = jnp.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points have shape {points.shape}: give (handles, 3)")
-    # Positions may be integers, but rotations must not be rounded to integers.
-    dtype = points.dtype if points.dtype.kind == "f" else jnp.result_type(float)
-    points = check_positions("points", points, points.shape, dtype, unit="handle")
-    rotations = as_array(rotations, dtype, "rotations")
-    if rotations.ndim != 2 or rotations.shape[1] != 3:
-        raise InputError(
-            f"rotations have shape {rotations.shape}: give (groups, 3) rotation vectors"
-        )
+    # The points give the type, unless they are integers: rotations must not be rounded to those.
+    dtype = float_type(points)
+    points = rows_of_three("points", points, dtype, unit="handle")
+    rotations = rows_of_three("rotations", rotations, dtype, unit="group")
     shape = rotations.shape
-    rotations = check_positions("rotations", rotations, shape, dtype, unit="group")
     translations = check_positions("translations", translations, shape, dtype, unit="group")
-    group = check_groups(group, len(points))
-    if len(group) and group.max() >= len(rotations):
-        raise InputError(
-            f"group {group.max()} is out of range: there are rotations for groups 0 to "
-            f"{len(rotations) - 1}"
-        )
+    group = check_labels("group", group, len(points), "handle", len(rotations))
     if centers is None:
         size = np.maximum(np.bincount(group, minlength=len(rotations)), 1)
         total = jnp.zeros(shape, dtype).at[group].add(points)

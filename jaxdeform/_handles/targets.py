@@ -15,7 +15,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._arrays import float_type, read_array, read_host_array, read_numbers
+from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._linalg.rotations import rotation_matrices
 
 Points = Float[np.ndarray, "points 3"] | Float[Array, "points 3"]
@@ -71,7 +72,7 @@ def rotate(
     if center is not None:
         center = _numbers(xp, "center", center, points.dtype, (3,))
     run = _rotate_compiled if xp is jnp else partial(_rotate, np)
-    return _run(run, points, _degrees(xp, degrees, points.dtype), _axis(axis), center)
+    return _run(run, points, _degrees(xp, degrees, points.dtype), _axis("axis", axis), center)
 
 
 def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLike = "y") -> Points:
@@ -93,7 +94,7 @@ def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLik
     """
     xp = _namespace(points, degrees)
     points = _points(xp, points)
-    axis = _axis(along)
+    axis = _axis("along", along)
     run = _twist_compiled if xp is jnp else partial(_twist, np)
     return _run(run, points, _degrees(xp, degrees, points.dtype), axis)
 
@@ -124,13 +125,13 @@ def bend(
     """
     xp = _namespace(points, degrees)
     points = _points(xp, points)
-    up, side = _axis(along), _axis(toward)
+    up, side = _axis("along", along), _axis("toward", toward)
     normal = np.cross(up, side)
     length = np.linalg.norm(normal)
     if length < 1e-9:
         raise InputError(
-            f"along is {along!r} and toward {toward!r}: a bar bends towards another axis than its "
-            "own"
+            f"along is {shown(along)} and toward {shown(toward)}: a bar bends towards another axis "
+            "than its own"
         )
     run = _bend_compiled if xp is jnp else partial(_bend, np)
     return _run(run, points, _degrees(xp, degrees, points.dtype), up, normal / length)
@@ -144,41 +145,31 @@ def _namespace(*arguments):
 
 
 def _points(xp, points: ArrayLike) -> Points:
-    try:
-        array = points if isinstance(points, jax.Array) else np.asarray(points)
-    except (TypeError, ValueError) as error:  # rows of different lengths
-        raise InputError(f"points cannot be read as numbers: {error}") from error
-    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
-        raise InputError(f"points have shape {array.shape}: give (n, 3) with n >= 1")
-    if array.dtype.kind not in "fiu":
-        raise InputError(f"points are of type {array.dtype}: give numbers")
-    if not isinstance(array, jax.Array):
+    if isinstance(points, jax.Array):
+        array = read_array(points, float_type(points), "points")
+    else:
+        array = read_numbers(points, "points")
         # Whole numbers, long doubles and other byte orders become what JAX can take too.
         single = array.dtype.kind == "f" and array.dtype.itemsize <= 4
-        with np.errstate(over="ignore"):
-            array = array.astype(np.float32 if single else np.float64)
+        array = read_host_array(array, np.float32 if single else np.float64, "points")
+    if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
+        raise InputError(f"points have shape {array.shape}: give (n, 3) with n >= 1")
     if not isinstance(array, Tracer):
         bad = np.flatnonzero(~np.isfinite(np.asarray(array)).all(axis=1))
         if bad.size:
             row = np.asarray(array)[bad[0]].tolist()
-            raise InputError(f"point {bad[0]} is {row}: give finite numbers")
-    return xp.asarray(array, array.dtype if array.dtype.kind == "f" else float)
+            raise InputError(f"points: point {bad[0]} is {row}: give finite numbers")
+    return xp.asarray(array)
 
 
 def _numbers(xp, name: str, value: ArrayLike, dtype, *shapes: tuple[int, ...]):
-    if value is None:
-        raise InputError(f"{name} is None: give numbers")
-    try:
-        with np.errstate(over="ignore"):
-            array = xp.asarray(value, dtype)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} cannot be read as numbers: {error}") from error
+    array = (read_array if xp is jnp else read_host_array)(value, dtype, name)
     if array.shape not in shapes:
-        allowed = " or ".join(map(str, shapes))
+        allowed = " or ".join(str(shape) if shape else "one number" for shape in shapes)
         raise InputError(f"{name} has shape {array.shape}: give {allowed}")
     if not isinstance(array, Tracer) and not np.isfinite(np.asarray(array)).all():
-        raise InputError(f"{name} is {np.asarray(array).tolist()}: give finite numbers")
-    return array
+        raise InputError(f"{name} is {shown(np.asarray(array))}: give finite numbers")
+    return xp.asarray(array)
 
 
 def _degrees(xp, degrees: ArrayLike, dtype):
@@ -191,20 +182,18 @@ def _degrees(xp, degrees: ArrayLike, dtype):
     return array
 
 
-def _axis(axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
+def _axis(name: str, axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
     if isinstance(axis, str):
         if axis not in ("x", "y", "z"):
-            raise InputError(f"axis '{axis}': give 'x', 'y', 'z' or a vector of three numbers")
+            raise InputError(
+                f"{name} is {shown(axis)}: give 'x', 'y', 'z' or a vector of three numbers"
+            )
         return np.eye(3)["xyz".index(axis)]
-    if isinstance(axis, Tracer):
-        raise InputError("the axis is traced by JAX: give its three numbers")
-    try:
-        vector = np.asarray(axis, np.float64)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
+    vector = read_host_array(axis, np.float64, name)
     if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
-        shown = axis.tolist() if isinstance(axis, np.ndarray | jax.Array) else axis
-        raise InputError(f"axis {shown}: give 'x', 'y', 'z' or a vector (3,) that is not zero")
+        raise InputError(
+            f"{name} is {shown(axis)}: give 'x', 'y', 'z' or a vector (3,) that is not zero"
+        )
     # Scaled first: squares of 1e-200 vanish, those of 1e308 overflow.
     vector = np.ldexp(vector, -int(np.frexp(np.abs(vector).max())[1]))
     return vector / np.linalg.norm(vector)

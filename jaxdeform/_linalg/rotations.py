@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdeform._linalg.small_matrices import (
     Grid,
     Matrices,
+    Scalars,
     as_grid,
     cross,
     from_grid,
@@ -107,24 +108,39 @@ def rotation_with_derivative(rotation: Matrices, c: Matrices) -> Matrices:
 def _rotation_jvp(primals, tangents):
     """``dR = R [w]x`` with ``(tr(M) I - M) w = axial(N - N^T)``, M = C R, N = R^T dC^T."""
     rotation, c = primals
+    fixed = jax.lax.stop_gradient((rotation, c))
     rotation = rotation_with_derivative(rotation, c)  # so that the rule itself has derivatives
-    dc = tangents[1]
-    r, rt = as_grid(rotation), transpose(as_grid(rotation))
+    # A turn of size 0 that has the derivatives of R by itself: reverse mode through a scan takes R
+    # for a constant (JAX drops the rule of what it knows), and a second derivative must not.
+    r = as_grid(rotation)
+    lean = _axial(product(transpose(r), transpose(as_grid(c))))
+    lean = [x - jax.lax.stop_gradient(x) for x in lean]
+    turn = _turn(*fixed, lean)
+    r = [[r[i][j] + turn[i][j] for j in range(3)] for i in range(3)]
+    rotation = from_grid(r)
+    lean = _axial(product(transpose(r), transpose(as_grid(tangents[1]))))
+    return rotation, from_grid(_turn(rotation, c, lean))
+
+
+def _axial(n: Grid) -> list[Scalars]:
+    return [n[2][1] - n[1][2], n[0][2] - n[2][0], n[1][0] - n[0][1]]
+
+
+def _turn(rotation: Matrices, c: Matrices, lean: list[Scalars]) -> Grid:
+    """Return ``R [w]x`` with ``(tr(M) I - M) w = lean``, M = C R."""
+    r = as_grid(rotation)
     m = product(as_grid(c), r)
-    n = product(rt, [[dc[j, i] for j in range(3)] for i in range(3)])
     trace = m[0][0] + m[1][1] + m[2][2]
     s = [
         [(trace if i == j else 0.0) - 0.5 * (m[i][j] + m[j][i]) for j in range(3)] for i in range(3)
     ]
-    axial = [n[2][1] - n[1][2], n[0][2] - n[2][0], n[1][0] - n[0][1]]
     cofactor = [cross(s[1], s[2]), cross(s[2], s[0]), cross(s[0], s[1])]
     det = inner(s[0], cofactor[0])
     floor = jnp.finfo(c.dtype).eps * jnp.abs(trace) ** 3 + jnp.finfo(c.dtype).tiny
     det = jnp.where(jnp.abs(det) > floor, det, jnp.inf)  # no unique rotation: the derivative is 0
-    w = [sum(cofactor[k][i] * axial[k] for k in range(3)) / det for i in range(3)]
+    w = [sum(cofactor[k][i] * lean[k] for k in range(3)) / det for i in range(3)]
     zero = jnp.zeros_like(trace)
-    skew = [[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]]
-    return rotation, from_grid(product(r, skew))
+    return product(r, [[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
 
 
 def quaternions_from_matrices(matrices: Float[Array, "rows 3 3"]) -> Float[Array, "rows 4"]:

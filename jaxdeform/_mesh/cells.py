@@ -7,6 +7,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_host_array, read_integers
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh, content_digest
@@ -83,10 +85,9 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
 
     - mesh: the rest shape.
     - r: an integer >= 1, or one per vertex, (vertices,).
-    - weights: (edges,), one finite weight per row of ``mesh.edges``, used as given. By default,
-      cotangent weights. Negative ones (obtuse angles) are kept, except where they make the moments
-      ``B_k = sum w e e^T`` of a cell indefinite: there they are set to 0, because stretching such a
-      cell would lower its energy. Few meshes have such cells.
+    - weights: (edges,), one finite weight per row of ``mesh.edges``. By default, cotangent weights.
+      Negative ones (obtuse angles) count as 0 in the few cells whose energy they leave without a
+      lower bound; :func:`precompute` names those.
 
     **Returns** :class:`Cells`.
 
@@ -98,10 +99,9 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
         >>> jd.rings(jd.shapes.bar(), 2)
         Cells(722 cells, 2160 edges, 41.8 edges per cell)
     """
+    check_type("mesh", mesh, Mesh)
     n = mesh.n_vertices
-    radius = np.asarray(r)
-    if radius.dtype.kind not in "iu":
-        raise InputError(f"r must be an integer, or one per vertex, got {radius.dtype}: try 1")
+    radius = read_integers(r, "r", "give one integer, or one per vertex, such as 1")
     if radius.ndim > 0 and radius.shape != (n,):
         raise InputError(
             f"r has shape {radius.shape}, but the mesh has {n} vertices: give one integer or ({n},)"
@@ -130,10 +130,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     ends.data = (ends.data == 2).astype(np.int8)
     ends.eliminate_zeros()
     ends.sort_indices()
-    chosen = _weights(mesh, weights)
-    if weights is None:
-        chosen = _bounded(mesh, ends, chosen)
-    return Cells(mesh, chosen, ends)
+    return Cells(mesh, _weights(mesh, weights), ends)
 
 
 def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
@@ -145,9 +142,8 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
     **Arguments**
 
     - mesh: the rest shape.
-    - weights: (edges,), as in :func:`rings`, but negative cotangent weights are always kept, as in
-      other ARAP programs: rotations do not need B. For a material on an obtuse mesh, use rings, or
-      pass weights that are not negative.
+    - weights: (edges,), as in :func:`rings`. A negative weight leaves nearly every star without a
+      lower bound. So, as in CGAL and unlike in libigl, negative weights count as 0 with spokes.
 
     **Returns** :class:`Cells`.
 
@@ -158,6 +154,7 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
         >>> jd.spokes(jd.shapes.bar())
         Cells(722 cells, 2160 edges, 6.0 edges per cell)
     """
+    check_type("mesh", mesh, Mesh)
     return Cells(mesh, _weights(mesh, weights), _incidence(mesh))
 
 
@@ -179,25 +176,6 @@ def principal_moments(
     return values, axes
 
 
-def indefinite_cells(cells: Cells) -> Int[np.ndarray, "bad"]:
-    """Return the cells with a clearly negative moment."""
-    moments, _ = principal_moments(cells)
-    return np.flatnonzero(moments[:, 0] < -1e-9 * np.abs(moments).max(axis=1))
-
-
-def _bounded(
-    mesh: Mesh, membership: sp.csr_matrix, weights: Float[np.ndarray, "edges"]
-) -> Float[np.ndarray, "edges"]:
-    """Set negative weights in indefinite cells to 0. Raising a weight harms no other cell."""
-    if (weights >= 0).all():
-        return weights
-    bad = indefinite_cells(Cells(mesh, weights, membership))
-    touched = np.unique(membership[bad].indices)
-    out = weights.copy()
-    out[touched] = np.maximum(out[touched], 0.0)
-    return out
-
-
 def _incidence(mesh: Mesh) -> sp.csr_matrix:
     """Return (vertices, edges): 1 where the vertex is an end of the edge."""
     count = len(mesh.edges)
@@ -213,7 +191,7 @@ def _incidence(mesh: Mesh) -> sp.csr_matrix:
 def _weights(mesh: Mesh, weights: ArrayLike | None) -> Float[np.ndarray, "edges"]:
     if weights is None:
         return cotangent_weights(mesh)
-    given = np.asarray(weights, dtype=np.float64)
+    given = read_host_array(weights, np.float64, "weights")
     if given.shape != (len(mesh.edges),):
         raise InputError(
             f"weights have shape {given.shape}: give one per row of mesh.edges, "

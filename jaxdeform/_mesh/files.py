@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_host_array
+from jaxdeform._checks import check_rigidity, check_type, read_path
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.formats import FORMATS
 from jaxdeform._mesh.mesh import Mesh
@@ -51,6 +53,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
         >>> jd.load_mesh(path)
         Mesh(722 vertices, 1440 faces)
     """
+    path = read_path("path", path)
     vertices, faces, source = read_arrays(path)
     try:
         return Mesh(vertices, faces, source=source)
@@ -100,9 +103,11 @@ def save_mesh(
         >>> jd.load_rigidity(path)[:2]
         array([0.5, 0.5])
     """
-    path = Path(path)
+    path = read_path("path", path)
     suffix = format_of(path)
-    points = np.asarray(mesh.vertices if vertices is None else vertices, np.float64)
+    check_type("mesh", mesh, Mesh)
+    points = mesh.vertices if vertices is None else vertices
+    points = read_host_array(points, np.float64, "vertices")
     if points.shape != mesh.vertices.shape:
         raise InputError(
             f"vertices have shape {points.shape}, but the mesh has {mesh.vertices.shape}: a pose "
@@ -117,17 +122,8 @@ def save_mesh(
     if rigidity is not None:
         if suffix != ".ply":
             raise InputError(f"{path}: only PLY carries rigidity per vertex: use a .ply name")
-        rigidity = np.asarray(rigidity, np.float64)
-        if rigidity.shape not in ((), (mesh.n_vertices,)):
-            raise InputError(
-                f"rigidity has shape {rigidity.shape}: give one number or ({mesh.n_vertices},)"
-            )
-        bad = np.flatnonzero(~(np.isfinite(rigidity) & (rigidity >= 0)))
-        if bad.size:
-            raise InputError(
-                f"{path}: rigidity {bad[0]} is {rigidity.flat[bad[0]]}: not written; give finite "
-                "numbers, 0 or more"
-            )
+        rigidity = read_host_array(rigidity, np.float64, "rigidity")
+        rigidity = np.asarray(check_rigidity(rigidity, mesh.n_vertices, rigidity.dtype))
     content = _content(path, suffix, mesh, points, rigidity)
     if path.suffix.lower() == ".gz":
         content = gzip.compress(content, mtime=0)
@@ -138,7 +134,7 @@ def _content(
     path: Path, suffix: str, mesh: Mesh, points: np.ndarray, rigidity: np.ndarray | None
 ) -> bytes:
     source = mesh.source if mesh.source and mesh.source.suffix == suffix else None
-    if source and rigidity is None and np.array_equal(points, mesh.vertices):
+    if source and rigidity is None and np.array_equal(points, source.points):
         return source.data
     if _is_binary_stl(suffix, mesh):
         loss = check_single_precision(path, points, mesh.faces)
@@ -176,7 +172,7 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
         >>> jd.load_rigidity(path).shape
         (722,)
     """
-    path = Path(path)
+    path = read_path("path", path)
     if format_of(path) != ".ply":
         raise InputError(f"{path}: rigidity is kept in .ply files only")
     columns = vertex_columns(path, without_mark(read_bytes(path)))
@@ -196,7 +192,7 @@ class FileArrays(NamedTuple):
     source: Source
 
 
-def read_arrays(path: str | os.PathLike) -> FileArrays:
+def read_arrays(path: Path) -> FileArrays:
     """Read vertices and faces as the file gives them, valid or not; polygons are cut.
 
     libigl is not used, because it crashes the process on a truncated OBJ, never returns from an
@@ -205,7 +201,6 @@ def read_arrays(path: str | os.PathLike) -> FileArrays:
     **Raises** InputError: the file is missing, empty, truncated or unreadable, its suffix is
     unknown, or it holds no faces.
     """
-    path = Path(path)
     suffix = format_of(path)
     data = read_bytes(path)
     with np.errstate(invalid="ignore"):  # what is not finite is refused later
@@ -220,7 +215,8 @@ def read_arrays(path: str | os.PathLike) -> FileArrays:
             f"{path}: face {polygons.sizes.argmax()} has {largest} corners: cut it into triangles "
             "in a modeller; here that would take too long"
         )
-    source = Source(suffix, data, polygons, trailing)
+    points.setflags(write=False)
+    source = Source(suffix, data, polygons, trailing, points)
     return FileArrays(points, triangles(points, polygons), source)
 
 

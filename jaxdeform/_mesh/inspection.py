@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._checks import read_path
+from jaxdeform._errors import ArrayLike, InputError, a_or_an
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
     NO_AREA,
@@ -28,12 +29,12 @@ def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike, Source | None]:
     if isinstance(mesh, Mesh):
         return mesh.vertices, mesh.faces, mesh.source
     if isinstance(mesh, str | os.PathLike):
-        return read_arrays(mesh)
-    try:
-        vertices, faces = mesh
-    except (TypeError, ValueError):
-        raise InputError("give a Mesh, a pair (vertices, faces), or the path of a file") from None
-    return vertices, faces, None
+        return read_arrays(read_path("mesh", mesh))
+    if not isinstance(mesh, list | tuple) or len(mesh) != 2:
+        raise InputError(
+            f"mesh is {a_or_an(mesh)}: give a Mesh, a pair (vertices, faces), or the path of a file"
+        )
+    return mesh[0], mesh[1], None
 
 
 def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:

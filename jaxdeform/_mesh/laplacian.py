@@ -1,15 +1,6 @@
 """Cotangent weights and the weighted graph Laplacian (thesis Sec. 2.4).
 
-An edge has a negative cotangent weight if its opposite angles sum to more than 180 degrees. This is
-the policy for such weights:
-
-- They are kept, so that A is the exact Dirichlet energy and the engine agrees with other ARAP
-  programs.
-- ``rings`` sets them to 0 in the few cells whose moments they make indefinite (cells.py).
-- Where A is still indefinite, ``precompute`` replaces all weights by :func:`lifted_weights`, with a
-  warning. The smoothness prior of estimation always uses lifted weights: with a negative weight it
-  would reward a difference across the edge.
-- :func:`normalised_laplacian` keeps its divisors away from 0.
+What is done about negative weights stands in bounded.py.
 """
 
 import igl
@@ -17,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from jaxdeform._checks import check_type
 from jaxdeform._mesh.mesh import Mesh
 
 
@@ -28,12 +20,10 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
     border edge has one such angle, an edge with three faces has three. Weights have no unit: they
     do not change when the mesh is scaled.
 
-    A weight is negative where the angles sum to more than 180 degrees. Such weights are kept: if
-    all edges have the same overlap, the stiffness matrix is then the exact Dirichlet energy, which
-    is never negative, and the engine agrees with other ARAP programs. Where cells of mixed size
-    make the matrix indefinite, :func:`precompute` lifts the negative weights to a small positive
-    one and warns. To have none from the start, pass ``np.maximum(w, 1e-6)`` to :func:`rings` or
-    :func:`spokes`.
+    A weight is negative where the angles sum to more than 180 degrees. Such weights are kept
+    wherever the energy of every cell has a lower bound with them; elsewhere they count as 0, and
+    :func:`precompute` warns. To have none from the start, pass ``np.maximum(w, 1e-6)`` to
+    :func:`rings` or :func:`spokes`.
 
     **Arguments**: mesh.
 
@@ -44,6 +34,7 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
         >>> jd.cotangent_weights(jd.shapes.bar()).shape
         (2160,)
     """
+    check_type("mesh", mesh, Mesh)
     # Scale first, because libigl squares areas: a mesh 1e-90 wide would underflow.
     vertices = mesh.vertices - mesh.vertices.mean(axis=0)
     vertices = vertices / np.abs(vertices).max()

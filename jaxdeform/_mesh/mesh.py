@@ -8,6 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
+from jaxdeform._arrays import read_host_array, read_integers
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.parsed import Source
 
@@ -29,16 +31,19 @@ class Mesh:
     other ARAP programs: a vertex that has no other face stays where it is.
 
     A mesh is a value. Two meshes with the same numbers are equal and have the same hash, even after
-    pickling or in another process. The arrays are read-only: copy one before you change it.
+    pickling or in another process. The arrays are read-only: copy one before you change it. Some
+    compiled functions take no read-only arrays even to read them, such as ``apply`` of SciPy's
+    ``Rotation``: give them a copy, ``rotation.apply(mesh.vertices.copy())``.
 
     **Arguments**
 
     - vertices: (vertices, 3), in any unit of length.
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
-    - source: what :func:`load_mesh` remembers of the file, for :func:`save_mesh`.
+    - source: what :func:`load_mesh` remembers of a file with these faces, for :func:`save_mesh`.
 
-    **Raises** InputError: an array is empty or has the wrong shape; a vertex is not finite; a face
-    index is out of range; a face repeats a vertex, or none has an area (:func:`repair`).
+    **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (there are no
+    derivatives to the rest shape); a vertex is not finite; a face index is out of range; a face
+    repeats a vertex, or none has an area (:func:`repair`); the source has other faces.
 
     Example:
         >>> import jaxdeform as jd
@@ -62,6 +67,12 @@ class Mesh:
     ) -> None:
         """Copy, check and freeze the arrays."""
         vertices, faces = checked_arrays(vertices, faces)
+        if source is not None:
+            check_type("source", source, Source)
+            if not source.fits(len(vertices), faces):
+                raise InputError(
+                    "source is of a mesh with other faces: leave it out, and the file will be new"
+                )
         bad = degenerate_faces(vertices, faces)
         for reason, face in bad:
             if reason != NO_AREA or len(bad) == len(faces):
@@ -108,6 +119,11 @@ class Mesh:
         return float(np.linalg.norm(np.ptp(self.vertices[self.referenced], axis=0)))
 
     @cached_property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Mean of the referenced vertices."""
+        return self.vertices[self.referenced].mean(axis=0)
+
+    @cached_property
     def digest(self) -> bytes:
         """A fingerprint of the content: the same for equal meshes, in every process."""
         return content_digest(self.vertices, self.faces)
@@ -131,16 +147,8 @@ class Mesh:
 
 def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return copies of valid shape, with finite vertices and indices in range, or raise."""
-    try:
-        points = np.array(vertices, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"vertices cannot be read as numbers: {error}") from error
-    try:
-        corners = np.array(faces, order="C")
-    except ValueError as error:
-        raise InputError(
-            f"faces cannot be read as an array of indices: {error}: give (faces, 3)"
-        ) from error
+    points = np.array(read_host_array(vertices, np.float64, "vertices"), order="C")
+    corners = np.array(read_integers(faces, "faces"), order="C")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(
             f"vertices have shape {points.shape}: give (vertices, 3), at least one vertex"
@@ -149,15 +157,12 @@ def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, n
         raise InputError(
             f"faces have shape {corners.shape}: give (faces, 3) triangles, at least one"
         )
-    if corners.dtype.kind not in "iu":
-        raise InputError(f"faces must be integers, got {corners.dtype}: give vertex indices")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise InputError(
             f"vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} in total): give finite "
             "positions"
         )
-    corners = corners.astype(np.int64)
     bad = np.flatnonzero(((corners < 0) | (corners >= len(points))).any(axis=1))
     if bad.size:
         raise InputError(

@@ -13,9 +13,9 @@ from jaxdeform._mesh.polygons import Polygons, area_vectors, from_lists, summed,
 from jaxdeform._mesh.words import (
     content,
     damaged,
+    excerpt,
     joined,
     position,
-    shown,
     stacked,
     text_of,
     whole,
@@ -50,8 +50,8 @@ def parse_obj(path: Path, data: bytes) -> Parsed:
             sizes.append(len(face))
         elif keyword not in _KEPT and keyword not in (b"", b"vn"):
             raise InputError(
-                f"{path}: line {number} {shown(words)} begins with an unknown keyword: correct it, "
-                "or put # before it"
+                f"{path}: line {number} {excerpt(words)} begins with an unknown keyword: correct "
+                "it, or put # before it"
             )
     announced = {kind: int(count) for kind, count in _COUNT.findall(data)}
     for kind, found in ((b"Vertices", points), (b"Faces", sizes)):
@@ -77,7 +77,7 @@ def _face(path: Path, number: int, words: list[bytes]) -> list[int]:
             raise ValueError
         return list(map(int, corners))
     except ValueError:
-        raise damaged(path, f"line {number} {shown(words)} is not a face") from None
+        raise damaged(path, f"line {number} {excerpt(words)} is not a face") from None
 
 
 def to_obj(points: np.ndarray, polygons: Polygons) -> bytes:

@@ -11,10 +11,10 @@ from jaxdeform._mesh.polygons import Polygons, from_lists, vertex_normals
 from jaxdeform._mesh.words import (
     content,
     damaged,
+    excerpt,
     joined,
     polygon,
     position,
-    shown,
     stacked,
     text_of,
     whole,
@@ -42,7 +42,7 @@ def parse_off(path: Path, data: bytes) -> Parsed:
         raise damaged(path, "has no counts of vertices and faces") from None
     body = filled[begin:]
     if not 0 <= n + m <= len(body) or min(n, m) < 0:
-        raise damaged(path, f"announces {shown(head)} vertices and faces but holds fewer")
+        raise damaged(path, f"announces {excerpt(head)} vertices and faces but holds fewer")
     points = [position(path, k + 1, content(lines[k])) for k in body[:n]]
     sizes: list[int] = []
     corners: list[int] = []

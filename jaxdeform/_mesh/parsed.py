@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxdeform._mesh.polygons import Polygons
 
@@ -30,3 +30,16 @@ class Source:
     """The faces as the file gives them; their vertices are those of the mesh."""
     trailing: int
     """The number of bytes behind the end of what the format describes."""
+    points: Float[np.ndarray, "points 3"]
+    """The positions in the file."""
+
+    def fits(self, n_vertices: int, faces: Int[np.ndarray, "faces 3"]) -> bool:
+        """Return whether a mesh is of this file: the polygons, cut in any way, at any positions."""
+        sizes, corners = self.polygons
+        if n_vertices != len(self.points) or len(faces) != int((sizes - 2).sum()):
+            return False
+        if (sizes == 3).all():
+            return np.array_equal(faces, corners.reshape(-1, 3))
+        polygon = np.arange(len(sizes)) * n_vertices
+        own = np.repeat(polygon, sizes) + corners
+        return bool(np.isin(np.repeat(polygon, sizes - 2)[:, None] + faces, own).all())

@@ -23,7 +23,7 @@ from jaxdeform._mesh.polygons import (
     unit,
     vertex_normals,
 )
-from jaxdeform._mesh.words import damaged, joined, polygon, real, shown, with_words
+from jaxdeform._mesh.words import damaged, excerpt, joined, polygon, real, with_words
 
 _NORMAL = ("nx", "ny", "nz")
 
@@ -98,7 +98,7 @@ def _numbers(path: Path, words: list[bytes], width: int) -> list[float]:
     except ValueError:
         row = []
     if len(row) < width:
-        raise damaged(path, f"the line {shown(words)} is not a vertex")
+        raise damaged(path, f"the line {excerpt(words)} is not a vertex")
     return row
 
 
@@ -109,7 +109,7 @@ def _corners(path: Path, line: bytes, element: Element, name: str) -> list[int]:
         if len(element.properties) > 1 and text_place(words, element, "") > len(words):
             raise IndexError
     except (ValueError, IndexError):
-        raise damaged(path, f"the line {shown(words)} is not a face") from None
+        raise damaged(path, f"the line {excerpt(words)} is not a face") from None
     if element.name == "tristrips":
         return polygon(path, "the strip", words[at:])
     return polygon(path, "the line", words[at:])

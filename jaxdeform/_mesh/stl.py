@@ -15,7 +15,7 @@ from jaxdeform._mesh.polygons import (
     from_triangles,
     unit,
 )
-from jaxdeform._mesh.words import content, damaged, position, shown, stacked, text_of, with_words
+from jaxdeform._mesh.words import content, damaged, excerpt, position, stacked, text_of, with_words
 
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 _HEAD = 84
@@ -74,8 +74,8 @@ def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"]
                 raise damaged(path, f"face {len(sizes) - 1} is a face with {sizes[-1]} corners")
         elif last not in _KEPT:
             raise InputError(
-                f"{path}: line {number} {shown(words)} begins with an unknown keyword: correct it, "
-                "or put # before it"
+                f"{path}: line {number} {excerpt(words)} begins with an unknown keyword: correct "
+                "it, or put # before it"
             )
     if last != b"endsolid":
         raise damaged(path, "does not end with endsolid")

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_integers, read_numbers
+from jaxdeform._checks import check_index, check_type, read_host_positions
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.mesh import Mesh
@@ -37,15 +39,12 @@ class Submesh:
 
         **Returns** (vertices, 3).
 
-        **Raises** InputError: a shape is wrong.
+        **Raises** InputError: a shape is wrong; a position is not finite.
         """
-        piece = np.asarray(vertices)
-        if piece.shape != (len(self.index), 3):
-            raise InputError(f"vertices have shape {piece.shape}: give ({len(self.index)}, 3)")
-        rest = self.whole.vertices if base is None else np.asarray(base)
-        if rest.shape != self.whole.vertices.shape:
-            raise InputError(f"base has shape {rest.shape}: give {self.whole.vertices.shape}")
-        out = np.array(rest, dtype=np.float64)
+        piece = read_host_positions("vertices", vertices, (len(self.index), 3))
+        whole = self.whole.vertices
+        out = whole if base is None else read_host_positions("base", base, whole.shape)
+        out = np.array(out)
         out[self.index] = piece
         return out
 
@@ -76,7 +75,9 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
         >>> piece.reinsert(out.vertices).shape
         (722, 3)
     """
+    check_type("mesh", mesh, Mesh)
     cells = rings(mesh, 1) if cells is None else cells
+    check_type("cells", cells, Cells)
     if cells.mesh != mesh:
         raise InputError("cells are of another mesh: call rings(mesh, r) for this one")
     is_free = _mask(free, mesh.n_vertices)
@@ -109,17 +110,16 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
 
 
 def _mask(free: ArrayLike, n: int) -> np.ndarray:
-    given = np.asarray(free)
+    given = read_numbers(free, "free")
     if given.dtype == bool:
         if given.shape != (n,):
             raise InputError(f"the mask of free vertices has shape {given.shape}: give ({n},)")
         mask = given
     else:
-        if given.ndim != 1 or given.dtype.kind not in "iu":
-            raise InputError("free must be a list of vertex indices, or a mask of booleans")
-        bad = given[(given < 0) | (given >= n)]
-        if bad.size:
-            raise InputError(f"free vertex {bad[0]} is out of range: vertices are 0 to {n - 1}")
+        given = read_integers(free, "free", "give a list of vertex indices, or a mask of booleans")
+        if given.ndim != 1:
+            raise InputError(f"free has shape {given.shape}: give one list of vertex indices")
+        check_index("free vertex", given, n)
         mask = np.zeros(n, bool)
         mask[given] = True
     if not mask.any():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxdeform._errors import InputError
+from jaxdeform._errors import InputError, shown
 
 _WORD = re.compile(rb"[^\s\\]+")
 
@@ -18,10 +18,10 @@ def damaged(path: Path, what: str) -> InputError:
     return InputError(f"{path}: {what}: the file is truncated or damaged; export it again")
 
 
-def shown(line: bytes | list[bytes]) -> str:
+def excerpt(line: bytes | list[bytes]) -> str:
     """Return the begin of a line of a file, for an error."""
     words = line.split() if isinstance(line, bytes) else line
-    return repr(b" ".join(words[:20])[:40].decode("ascii", "replace"))
+    return shown(b" ".join(words[:20])[:60].decode("ascii", "replace"))
 
 
 def real(word: bytes) -> float:
@@ -51,7 +51,7 @@ def position(path: Path, line: int, words: list[bytes]) -> tuple[float, float, f
             raise ValueError
         return float(x), float(y), float(z)
     except ValueError:
-        raise damaged(path, f"line {line} {shown(words)} is not a vertex") from None
+        raise damaged(path, f"line {line} {excerpt(words)} is not a vertex") from None
 
 
 def polygon(path: Path, where: str | int, words: list[bytes]) -> list[int]:
@@ -65,11 +65,11 @@ def polygon(path: Path, where: str | int, words: list[bytes]) -> list[int]:
             raise ValueError
         corners = list(map(int, part))
     except (ValueError, IndexError):
-        raise damaged(path, f"{where} {shown(words)} is not a face") from None
+        raise damaged(path, f"{where} {excerpt(words)} is not a face") from None
     if size < 3:
         raise damaged(path, f"{where} is a face with {size} corners")
     if len(corners) < size:
-        raise damaged(path, f"{where} {shown(words)} is not a face")
+        raise damaged(path, f"{where} {excerpt(words)} is not a face")
     return corners
 
 

@@ -362,9 +362,9 @@ def test_what_stl_cannot_hold_is_refused_before_the_work_and_rescued_after(run, 
 
 def test_bad_files_of_parts(run, files, bar):
     texts = {
-        "has 3 numbers, but the mesh has 722 vertices": "0 1 0",
+        "parts have shape (3,): give one integer per vertex, (722,)": "0 1 0",
         "the part of vertex 0 is '1_0': give an integer": "1_0 " * 722,
-        "the part of vertex 1 is 1000000000: give": "0 1000000000 " * 361,
+        "the part of vertex 1 is 1000000000, out of range": "0 1000000000 " * 361,
         "the part of vertex 0 is '-0.5'": "-0.5 " * 722,
         "the part of vertex 2 is -1": "0 0 -1 " + "0 " * 719,
         "the part of vertex 0 is '" + "9" * 50: "9" * 5000 + " 0" * 721,

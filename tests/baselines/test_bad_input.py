@@ -62,11 +62,11 @@ def bad_calls():
         "distance of vertex 0 to control 0 is -inf": lambda: jd.rigid_weights(
             vertices, np.eye(3), distances=-far
         ),
-        "handle 9 .*out of range": lambda: jd.geodesic_distances(square, [9]),
+        "source 9 .*out of range": lambda: jd.geodesic_distances(square, [9]),
         "need a manifold surface": lambda: jd.geodesic_distances(fan, [0]),
         "distances need a manifold": lambda: jd.geodesic_distances(touching, [0]),
         "handle 99 .*out of range": lambda: bbw(square, [99]),
-        "group 1 has no handles": lambda: bbw(square, [0, 8], [0, 2]),
+        "group 1 has no handles": lambda: bbw(square, [0, 8, 2], [0, 2, 2]),
         "the group of handle 1 is -1": lambda: bbw(square, [0, 8], [0, -1]),
         "group has shape": lambda: bbw(square, [0, 8], [0]),
         "vertex 9 belongs to no face": lambda: bbw(loose, [0]),
@@ -76,7 +76,7 @@ def bad_calls():
             [[0, 0, 0]], jd.Mesh(CUBE.vertices, [CUBE.faces[0][::-1], *CUBE.faces[1:]])
         ),
         r"vertex 1 \[0.0, 1.5, 0.0\] is outside": lambda: mvc([[0, 0, 0], [0, 1.5, 0]], CUBE),
-        "vertices have shape .*finite": lambda: mvc([[0, 0, np.nan]], CUBE),
+        "vertices of vertex 0 are not finite": lambda: mvc([[0, 0, np.nan]], CUBE),
         "skeletons are .tgf files": lambda: jd.load_skeleton("bones.txt"),
         "cannot be read": lambda: jd.load_skeleton("nowhere.tgf"),
     }

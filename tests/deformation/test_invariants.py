@@ -51,7 +51,7 @@ def test_rigid_motion_of_the_handles_moves_everything_rigidly(bar, bar_problem, 
         2.0,
         normals=normals,
         start=bar.vertices if not normals else moved,
-        solver=jd.Alternating(5) if normals else jd.QuasiNewton(tolerance=1e-14),
+        solver=jd.Alternating(5) if normals else jd.QuasiNewton(tolerance=1e-16),
     )
     assert relative(out.vertices, moved) < 1e-6
     np.testing.assert_allclose(out.transforms, np.broadcast_to(turn, (722, 3, 3)), atol=1e-5)

@@ -33,6 +33,13 @@ class Corotated:
         again = self.solve(c, b, rigidity, rotate)
         return t + again - jax.lax.stop_gradient(again)
 
+    def energy(self, t, c, b, rigidity):
+        turned = jnp.swapaxes(t, 0, 1)
+        r = jd.RotationFit().minimize(jax.lax.stop_gradient(turned), b, rigidity)
+        r = jd.RotationFit().with_implicit_derivative(r, turned, b, rigidity)
+        strain = self.factor * rigidity * jnp.sum((t - r) ** 2, axis=(0, 1))
+        return strain + jnp.sum(t**2 * b[None] - 2 * t * jnp.swapaxes(c, 0, 1), axis=(0, 1))
+
 
 @pytest.fixture(scope="module")
 def sheet():
@@ -54,6 +61,18 @@ def test_another_material_reaches_its_own_equilibrium(sheet):
     doubled = jd.deform(problem, targets, 0.6, local=Corotated(), solver=jd.Alternating(1000))
     np.testing.assert_allclose(doubled.vertices, ends[Corotated(2.0)], atol=1e-8)
     assert np.abs(ends[jd.Newton()] - ends[Corotated()]).max() > 1e-3
+
+
+@pytest.mark.parametrize("local", [Corotated(), jd.AffineFit()])
+def test_both_solvers_reach_the_minimum_of_another_energy(sheet, local):
+    """QuasiNewton accepts steps by the energy of the law, not by that of Eq. 4.4."""
+    problem, targets = sheet
+    slow = jd.deform(problem, targets, 0.3, local=local, solver=jd.Alternating(20_000))
+    fast = jd.deform(problem, targets, 0.3, local=local, solver=jd.QuasiNewton(tolerance=1e-14))
+    assert fast.result == jd.Result.converged
+    size = float(slow.energy[0])  # the affine fit ends at 0
+    np.testing.assert_allclose(fast.energy[-1], slow.energy[-1], atol=1e-12 * size)
+    np.testing.assert_allclose(fast.vertices, slow.vertices, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,8 +135,8 @@ class Forgetful(Corotated):
 WRONG = {
     "text 'arap': give a local step, such as .*RotationFit": "arap",
     r"class RotationFit: give RotationFit\(\) instead": jd.RotationFit,
-    "type NoneType, without the method minimize": None,
-    r"type NoDerivative, without the method with_implicit_derivative\(t, c, b": NoDerivative(),
+    "local is None, without minimize: give a local step": None,
+    "local is a NoDerivative, without with_implicit_derivative": NoDerivative(),
     r"OldProtocol.minimize cannot be called with \(c, b, rigidity\)": OldProtocol(),
     "Unhashable is not hashable.*frozen": Unhashable(),
     r"CellsFirst.minimize returned .*\(3, 3, 5\)": CellsFirst(),

@@ -14,7 +14,7 @@ import jaxdeform as jd
 def plain_arap(mesh, handles, targets, start, steps):
     """Eq. 3.3 in NumPy, float64 throughout: spokes, LAPACK's SVD, SciPy's LU."""
     n, (i, j) = mesh.n_vertices, mesh.edges.T
-    w = jd.cotangent_weights(mesh)
+    w = np.maximum(jd.cotangent_weights(mesh), 0.0)
     free = np.setdiff1d(np.arange(n), handles)
     laplacian = scipy.sparse.csgraph.laplacian(
         scipy.sparse.coo_matrix((np.r_[w, w], (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
@@ -36,13 +36,9 @@ def plain_arap(mesh, handles, targets, start, steps):
     return p
 
 
-@pytest.mark.parametrize(
-    ("name", "peer"),
-    # Thin arms multiply libigl's float32 rotations: 7e-6 after 20 steps on a cactus, where
-    # float64 agrees to 1e-9 with us.
-    [("bar", PEER), ("cylinder", PEER), ("cactus", 2e-5), ("cactus.off", 2e-5)],
-)
-def test_rotation_fit_on_spokes_is_arap(name, peer):
+@pytest.mark.parametrize("name", ["bar", "cylinder", "cactus", "cactus.off"])
+@pytest.mark.filterwarnings("ignore:negative weights")
+def test_rotation_fit_on_spokes_is_arap(name):
     mesh = real_mesh(name) if "." in name else getattr(jd.shapes, name)()
     long = int(np.argmax(np.ptp(mesh.vertices, axis=0)))
     handles = ends(mesh, along=long)
@@ -54,11 +50,13 @@ def test_rotation_fit_on_spokes_is_arap(name, peer):
         problem, targets, 0.0, local=jd.RotationFit(), solver=TWENTY, start=start
     ).vertices
     assert relative(out, plain_arap(mesh, handles, targets, start, 20)) < 1e-9
+    if (jd.cotangent_weights(mesh) < 0).any():
+        return  # libigl keeps negative weights
     data = igl.ARAPData()
     data.energy = igl.ARAPEnergyType.ARAP_ENERGY_TYPE_SPOKES
     data.max_iter = 20
     igl.arap_precomputation(mesh.vertices, mesh.faces, 3, handles, data)
-    assert relative(out, igl.arap_solve(targets, data, start.copy())) < peer
+    assert relative(out, igl.arap_solve(targets, data, start.copy())) < PEER
 
 
 def test_single_precision(bar, bar_problem, bar_targets):

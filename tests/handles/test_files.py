@@ -112,7 +112,10 @@ def test_bad_groups_are_named(tmp_path, bar, message):
         (b'{"handles": []}', "with at least one group"),
         (b"\xff\xfe\x00", "is not a text file"),
         (b'{"handles": [{"vertices": [' + b"9" * 5000 + b"]}]}", "is not valid JSON .Exceeds"),
-        (b'{"handles": [{"vertices": [' + b"9" * 400 + b"]}]}", "handles must be integers"),
+        (
+            b'{"handles": [{"vertices": [' + b"9" * 400 + b"]}]}",
+            "handles cannot be read as numbers",
+        ),
         (
             b'{"handles": [{"vertices": [0], "translation": [0, 0, ' + b"9" * 400 + b"]}]}",
             "translation: give numbers",
@@ -170,6 +173,7 @@ def test_bad_survey_files_are_named(tmp_path):
         "h.sel: has 8 numbers, but the mesh has 9 vertices": (good[2:], MATRIX),
         "h.sel: vertex 4 is '3': give 0 .fixed., 1": ("0 1 2 1 3 1 2 1 0", MATRIX),
         "h.sel: vertex 0 is 'x'": ("x 1 2 1 1 1 2 1 0", MATRIX),
+        r"h.sel: vertex 1 is 'x{56}\.\.\.: give 0": (f"0 {'x' * 20_000} 2 1 1 1 2 1 0", MATRIX),
         "h.sel: no handles": ("1 " * 9, MATRIX),
         "h.def: the matrix: give 4 x 4 finite numbers": (good, MATRIX[:-8]),
         "h.def: the matrix: give numbers": (good, MATRIX + "1\n"),

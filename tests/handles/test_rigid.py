@@ -103,8 +103,10 @@ def bad_calls():
         "translations have shape": lambda: rigid(points, group, two, two[:1]),
         "centers have shape": lambda: rigid(points, group, two, two, two[0]),
         "group has shape": lambda: rigid(points, group[:2], two, two),
-        "type float64: give one integer": lambda: rigid(points, [0.0, 1.0, 0.0], two, two),
-        "group 2 is out of range": lambda: rigid(points, [0, 1, 2], two, two),
+        "group must be integers, got float64: give one integer": lambda: rigid(
+            points, [0.0, 1.0, 0.0], two, two
+        ),
+        "the group of handle 2 is 2, out of range": lambda: rigid(points, [0, 1, 2], two, two),
         "the group of handle 1 is -1": lambda: rigid(points, [0, -1, 1], two, two),
     }
 

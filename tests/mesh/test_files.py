@@ -79,9 +79,9 @@ def test_bad_arguments_leave_the_old_file(tmp_path, odd):
         r"vertices have shape \(7, 3\)": {"vertices": odd.vertices[1:]},
         "vertex 3 is .*nan": {"vertices": nan},
         r"rigidity has shape \(2,\)": {"rigidity": [1.0, 2.0]},
-        "rigidity 0 is nan": {"rigidity": np.nan},
-        "rigidity 7 is -1.0": {"rigidity": replaced(np.ones(8), 7, -1.0)},
-        "rigidity 2 is inf": {"rigidity": replaced(np.ones(8), 2, np.inf)},
+        "rigidity is nan: it must be": {"rigidity": np.nan},
+        "rigidity is -1.0 at vertex 7": {"rigidity": replaced(np.ones(8), 7, -1.0)},
+        "rigidity is inf at vertex 2": {"rigidity": replaced(np.ones(8), 2, np.inf)},
     }.items():
         with pytest.raises(jd.InputError, match=message):
             jd.save_mesh(path, odd, **settings_)

@@ -1,8 +1,11 @@
 """Faces without area: kept, and without a part in the energy."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EXACT, TWENTY
+from helpers import EXACT, FD, TWENTY
+from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
 
@@ -37,6 +40,24 @@ def test_a_mesh_deforms_as_without_them(pair, normals):
     np.testing.assert_allclose(poses[1], poses[0], atol=EXACT)
     # The vertex that has no other face stays.
     np.testing.assert_allclose(poses[1][9], pair[1].vertices[9], atol=EXACT)
+
+
+def test_derivatives_to_the_rest_shape_leave_them_out(pair):
+    # Turned, so that rounding gives the flat faces an area.
+    turn = Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix()
+    turned = [jd.Mesh(m.vertices @ turn.T, m.faces) for m in pair]
+    handles = np.array([0, 1, 2, 6, 7, 8])
+    targets = turned[0].vertices[handles] + np.outer(handles > 2, [0.0, 0.0, 1.0])
+    slopes = []
+    for mesh in turned:
+        problem = jd.precompute(mesh, handles)
+
+        def height(rest, problem=problem):
+            return jnp.sum(jd.deform(problem, targets, 1.0, rest=rest).vertices[4] ** 2)
+
+        slopes.append(jax.grad(height)(jnp.asarray(mesh.vertices)))
+    assert np.abs(slopes[0]).max() > 0.01
+    np.testing.assert_allclose(slopes[1], slopes[0], rtol=FD, atol=FD * np.abs(slopes[0]).max())
 
 
 def test_files_keep_them_and_inspect_tells_of_them(tmp_path, pair):

@@ -24,7 +24,7 @@ def test_bad_arrays_are_named():
         r"faces have shape \(0,\)": (v, []),
         r"faces have shape \(1, 4\)": (v, [[0, 1, 2, 3]]),
         "faces must be integers, got float64": (v, f * 1.0),
-        "faces cannot be read as an array": (v, [[0, 1, 2], [0, 1]]),
+        "faces cannot be read as numbers": (v, [[0, 1, 2], [0, 1]]),
         "vertices cannot be read as numbers": ([["a", "b", "c"]], f),
     }
     for message, (vertices, faces) in bad.items():

@@ -38,6 +38,26 @@ def test_new_positions_come_back_and_the_rest_stays(tmp_path, name):
     assert back.source.trailing == mesh.source.trailing
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_source_goes_with_other_positions_but_not_with_other_faces(tmp_path, name):
+    mesh = jd.load_mesh(CASES / name)
+    pose = jd.Mesh(moved(mesh), mesh.faces, source=mesh.source)
+    jd.save_mesh(tmp_path / name, mesh, vertices=moved(mesh))
+    want = (tmp_path / name).read_bytes()
+    jd.save_mesh(tmp_path / name, pose)
+    assert (tmp_path / name).read_bytes() == want
+    one_more = np.append(mesh.vertices, [[0.0, 0.0, 1.0]], axis=0)
+    others = [
+        (one_more, mesh.faces),
+        (mesh.vertices, np.append(mesh.faces, mesh.faces[:1], axis=0)),
+    ]
+    if len(mesh.source.polygons.sizes) > 1:
+        others.append((mesh.vertices, np.roll(mesh.faces, 1, axis=0)))
+    for vertices, faces in others:
+        with pytest.raises(jd.InputError, match="source is of a mesh with other faces"):
+            jd.Mesh(vertices, faces, source=mesh.source)
+
+
 @pytest.mark.parametrize("name", ["02_quads.obj", "24_quad.off", "07_colors_w.obj"])
 def test_libigl_reads_what_we_rewrite(tmp_path, name):
     mesh = jd.load_mesh(CASES / name)

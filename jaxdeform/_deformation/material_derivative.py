@@ -1,0 +1,88 @@
+"""The derivative of the local step of the material: of its minimum, not of its iterations."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdeform._deformation.cell_energy import half_gradient, half_hessian, half_hessian_product
+from jaxdeform._linalg.small_matrices import (
+    Grid,
+    Matrices,
+    Scalars,
+    Vectors,
+    as_grid,
+    from_grid,
+    ldl_factor,
+    ldl_solve,
+    minus_identity,
+    product,
+    transpose,
+)
+
+
+@jax.custom_jvp
+def material_with_derivative(t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    """Return t, known to minimise Eq. 4.2 for C, b and lambda, with the derivatives of that."""
+    del c, b, rigidity
+    return t
+
+
+@material_with_derivative.defjvp
+def _material_with_derivative_jvp(primals, tangents):
+    """Differentiate the condition grad phi(T) = 0 instead of the iterations.
+
+    ``H dT = dC^T - T dB - 2 (T T^T T - T) dlambda`` with H half the Hessian. A prototype that
+    differentiated the iterations took 40 s to compile.
+    """
+    t, c, b, rigidity = primals
+    hessian = _Hessian.at(t, b, rigidity)
+    t = material_with_derivative(t, c, b, rigidity)  # so that this rule has derivatives too
+    # A Newton step from t of size 0. It has the derivatives of T by itself: reverse mode through a
+    # scan takes t for a constant (JAX drops the rule of what it knows), and a second derivative
+    # must not.
+    slope = from_grid(half_gradient(as_grid(t), as_grid(c), list(b), rigidity))
+    t = t - hessian.solve(hessian.of, slope - jax.lax.stop_gradient(slope))
+    _, dc, db, dlam = tangents
+    tg = as_grid(t)
+    excess = product(tg, minus_identity(product(transpose(tg), tg)))
+    right = [
+        [dc[j, i] - tg[i][j] * db[j] - 2.0 * excess[i][j] * dlam for j in range(3)]
+        for i in range(3)
+    ]
+    return t, hessian.solve((tg, list(b), rigidity), from_grid(right))
+
+
+class _Hessian(NamedTuple):
+    """Half the Hessian of phi in every cell, factored.
+
+    As a linear solve of its own, so that derivatives of second order solve again instead of
+    differentiating the 9x9 elimination. H is factored outside of it: what solves for many right
+    sides, as conjugate gradients do, factors once.
+    """
+
+    of: tuple[Grid, list[Array], Array]
+    """T, b and lambda where it was factored, as constants."""
+    factor: Any
+
+    @staticmethod
+    def at(t: Matrices, b: Vectors, rigidity: Scalars) -> "_Hessian":
+        """Factor H; directions without stiffness get a floor."""
+        t, b, rigidity = jax.lax.stop_gradient((t, b, rigidity))
+        scale = rigidity + jnp.max(jnp.abs(b), axis=0)
+        floor = jnp.finfo(t.dtype).eps * scale + jnp.finfo(t.dtype).tiny
+        of = as_grid(t), list(b), rigidity
+        return _Hessian(of, ldl_factor(half_hessian(*of), floor))
+
+    def solve(self, of: tuple[Grid, list[Array], Array], right: Matrices) -> Matrices:
+        """Solve H dT = right, with the derivatives of H where it is ``of`` T, b and lambda."""
+
+        def apply(v: Matrices) -> Matrices:
+            return from_grid(half_hessian_product(*of, as_grid(v)))
+
+        def solve(_, r: Matrices) -> Matrices:
+            solution = ldl_solve(self.factor, [r[i, j] for i in range(3) for j in range(3)])
+            return from_grid([solution[3 * i : 3 * i + 3] for i in range(3)])
+
+        return jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)

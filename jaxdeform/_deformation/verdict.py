@@ -1,0 +1,44 @@
+"""What is said of a deformation: its result, and the cells that are inside out."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxdeform._deformation.descent import Descent
+from jaxdeform._deformation.problem import System
+from jaxdeform._deformation.reduced_energy import Inputs
+from jaxdeform._result import Result
+
+# A vertex further than this many diagonals from the box of the mesh and its targets is no answer.
+_FAR = 10.0
+
+
+def verdict(system: System, inputs: Inputs, end: Descent) -> Result:
+    """Return the result of a descent: its own, unless the input or the end is no good.
+
+    Inside jit the values of arguments cannot be checked by an exception, so they are here.
+    """
+    energy = end.energy[end.steps]
+    finite = jnp.isfinite(energy) & jnp.all(jnp.isfinite(end.positions))
+    moved = jnp.where(system.free[None], system.rest, inputs.targets)
+    both = jnp.concatenate([system.rest, moved], axis=1)
+    low, high = both.min(axis=1, keepdims=True), both.max(axis=1, keepdims=True)
+    margin = _FAR * jnp.sqrt(jnp.sum((high - low) ** 2))
+    near = jnp.all((end.positions >= low - margin) & (end.positions <= high + margin))
+    proportionate = near & (energy >= -10.0 * end.rounding)
+    valid = (
+        jnp.all(jnp.isfinite(inputs.targets))
+        & jnp.all((inputs.rigidity >= 0) & jnp.isfinite(inputs.rigidity))
+        & jnp.all((inputs.soft >= 0) & (inputs.soft <= system.soft))
+    )
+    if inputs.geometry is not None:
+        off = jnp.abs(inputs.geometry.rest - system.rest)
+        valid &= jnp.all(off <= 1e-6 * jnp.max(jnp.abs(system.rest)))
+    result = Result.where(finite & ~proportionate, Result.out_of_proportion, end.result)
+    result = Result.where(finite, result, Result.not_finite)
+    return Result.where(valid, result, Result.bad_input)
+
+
+def inside_out(transforms: Float[Array, "3 3 vertices"]) -> Int[Array, ""]:
+    """Return the number of cells whose transformation does not keep its orientation: det T <= 0."""
+    a, b, c = transforms
+    return jnp.sum(jnp.sum(a * jnp.cross(b, c, axis=0), axis=0) <= 0.0, dtype=jnp.int32)

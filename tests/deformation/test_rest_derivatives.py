@@ -1,0 +1,104 @@
+"""Derivatives to the rest shape and the edge weights, by differences of precompute and deform."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import FD, held_sheet, replaced
+
+import jaxdeform as jd
+
+TIGHT = jd.QuasiNewton(tolerance=1e-16)
+
+
+@pytest.fixture(scope="module")
+def case():
+    mesh, handles, targets = held_sheet()
+    rng = np.random.default_rng(2)
+    weight = jnp.asarray(rng.normal(size=mesh.vertices.shape))
+    direction = 0.1 * rng.normal(size=mesh.vertices.shape)
+    rigidity = rng.uniform(0.2, 2.0, mesh.n_vertices)
+    return mesh, handles, targets, rigidity, weight, direction
+
+
+def value(out, weight, of_transforms=1.0):
+    shape = jnp.sum(weight * out.vertices) + 3.0 * out.energy[-1]
+    return shape + of_transforms * jnp.sum(out.transforms**2)
+
+
+@pytest.mark.parametrize("soft", [np.inf, 2.0])
+@pytest.mark.parametrize("local", [jd.Newton(), jd.RotationFit(), jd.AffineFit()])
+def test_derivatives_to_the_rest_shape(case, local, soft):
+    mesh, handles, targets, rigidity, weight, direction = case
+    # The affine fit of a flat cell (a corner with one face) jumps along the normal with the shape.
+    part = 0.0 if local == jd.AffineFit() else 1.0
+
+    def whole(s):
+        moved = jd.Mesh(mesh.vertices + s * direction, mesh.faces)
+        problem = jd.precompute(moved, handles, handle_weights=soft)
+        out = jd.deform(problem, targets, rigidity, local=local, solver=TIGHT)
+        return value(out, weight, part)
+
+    problem = jd.precompute(mesh, handles, handle_weights=soft)
+    h = 1e-5
+    want = float(whole(h) - whole(-h)) / (2 * h)
+
+    @jax.jit
+    def loss(rest):
+        out = jd.deform(problem, targets, rigidity, local=local, rest=rest)
+        return value(out, weight, part)
+
+    rest = jnp.asarray(mesh.vertices)
+    _, forward = jax.jvp(loss, (rest,), (jnp.asarray(direction),))
+    np.testing.assert_allclose(forward, want, rtol=FD)
+    np.testing.assert_allclose(jnp.sum(jax.grad(loss)(rest) * direction), want, rtol=FD)
+
+
+def test_derivatives_to_the_edge_weights(case):
+    mesh, handles, targets, rigidity, weight, _ = case
+    w = jd.cotangent_weights(mesh) + 0.3
+    direction = np.random.default_rng(3).normal(size=w.shape)
+
+    def whole(s):
+        cells = jd.rings(mesh, weights=w + s * direction)
+        problem = jd.precompute(mesh, handles, cells=cells)
+        return value(jd.deform(problem, targets, rigidity, solver=TIGHT), weight)
+
+    problem = jd.precompute(mesh, handles, cells=jd.rings(mesh, weights=w))
+    want = float(whole(1e-5) - whole(-1e-5)) / 2e-5
+
+    @jax.jit
+    def loss(weights):
+        return value(jd.deform(problem, targets, rigidity, edge_weights=weights), weight)
+
+    _, forward = jax.jvp(loss, (jnp.asarray(w),), (jnp.asarray(direction),))
+    np.testing.assert_allclose(forward, want, rtol=FD)
+    np.testing.assert_allclose(jnp.sum(jax.grad(loss)(jnp.asarray(w)) * direction), want, rtol=FD)
+
+
+def test_another_rest_shape_is_refused_and_said_inside_jit(case):
+    mesh, handles, targets, *_ = case
+    problem = jd.precompute(mesh, handles)
+    other = replaced(mesh.vertices, (5, 2), 9.0)
+    with pytest.raises(jd.InputError, match="rest of vertex 5 are not the problem's own"):
+        jd.deform(problem, targets, 1.0, rest=other)
+    with pytest.raises(jd.InputError, match="edge_weights of edge 0 are not the problem's own"):
+        jd.deform(problem, targets, 1.0, edge_weights=problem.cells.weights + 1.0)
+    run = jax.jit(lambda rest: jd.deform(problem, targets, 1.0, rest=rest).result)
+    assert run(jnp.asarray(other)) == jd.Result.bad_input
+    assert run(jnp.asarray(mesh.vertices)) == jd.Result.converged
+
+
+def test_what_has_no_derivative_raises(case):
+    mesh, handles, targets, *_ = case
+    problem = jd.precompute(mesh, handles)
+
+    def loss(system):
+        moved = jd.Problem(system, problem.handles, problem.cells)
+        return jnp.sum(jd.deform(moved, targets, 1.0).vertices ** 2)
+
+    with pytest.raises(jd.InputError, match="arrays of a Problem have no derivative"):
+        jax.grad(loss, allow_int=True)(problem.system)
+    for solver in (jd.Alternating(5),):
+        with pytest.raises(jd.InputError, match="differentiated by Implicit"):
+            jd.deform(problem, targets, 1.0, rest=mesh.vertices, solver=solver)
