@@ -36,6 +36,11 @@ _INSTEAD = {
         "path": "call jd.precompute(jd.load_mesh(path), handles) first",
         "": "give what jd.precompute(mesh, handles) returns",
     },
+    "Source": {
+        "Mesh": "give mesh.source",
+        "path": "give jd.load_mesh(path).source",
+        "": "give mesh.source of a mesh that jd.load_mesh read, or None",
+    },
 }
 
 

@@ -9,22 +9,32 @@ else:
     # checks, which say what is wrong with it.
     ArrayLike = Any
 
+_LONGEST = 1000
+
 
 class InputError(ValueError):
-    """Wrong input: names the vertex, face, file or argument, the reason, and the next move."""
+    """Wrong input: names the vertex, face, file or argument, the reason, and the next move.
+
+    The text is one line of bounded length. Control characters, which may come from a file, are
+    shown as escapes, so that they never reach a terminal.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        """Keep the text, made safe to print."""
+        super().__init__(printable(text, _LONGEST))
 
 
-def shown(value) -> str:
-    """Return one short line for any value."""
+def shown(value: Any) -> str:
+    """Return one short line for any value, without control characters."""
     try:
         text = repr(value) if isinstance(value, str | bytes) else str(value)
     except ValueError:  # an integer of more than 4300 digits
-        text = a_or_an(value)
-    text = " ".join(text.split())
+        text = f"{a_or_an(value)} too long to print"
+    text = printable(" ".join(text.split()))
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def a_or_an(value) -> str:
+def a_or_an(value: Any) -> str:
     """Return the type of a value, with its article."""
     if value is None:
         return "None"
@@ -32,3 +42,15 @@ def a_or_an(value) -> str:
         return f"the class {value.__name__}"
     name = type(value).__name__
     return f"{'an' if name[0] in 'aeiouAEIO' else 'a'} {name}"
+
+
+def printable(text: str, longest: int | None = None) -> str:
+    r"""Return the text with escapes for what no terminal should get, such as ``\x1b``.
+
+    A longer text than ``longest`` loses its middle.
+    """
+    if longest is not None and len(text) > longest:
+        text = f"{text[: longest - 300]} ... {text[-295:]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -2,8 +2,8 @@
 
 import os
 from collections.abc import Sequence
-from functools import partial
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from jaxtyping import Float
 from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_count, check_type, read_host_positions, read_path
 from jaxdeform._errors import ArrayLike, InputError, a_or_an
-from jaxdeform._mesh.files import check_place, write_atomically
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.writing import check_place, write_atomically
 
 # Where the CPU draws, 40 million pixels take 3 GB; 16,384 is the width that graphics systems allow.
 _MOST_PIXELS, _MOST_WIDTH = 40e6, 16384
@@ -91,7 +91,7 @@ def render(
     plotter.reset_camera(bounds=_bounds(together))  # pyright: ignore[reportCallIssue]
     image = np.asarray(plotter.screenshot(return_img=True))
     plotter.close()
-    write_atomically(path, partial(_write_png, image))
+    write_atomically(path, _png(image))
 
 
 def _read_poses(mesh: Mesh, poses: Any) -> list[np.ndarray]:
@@ -148,10 +148,12 @@ def _color_scale(shown: Sequence[ArrayLike], label: str) -> dict[str, Any]:
     }
 
 
-def _write_png(image: np.ndarray, name: str) -> None:
+def _png(image: np.ndarray) -> bytes:
     from PIL import Image  # comes with pyvista
 
-    Image.fromarray(image).save(name, format="PNG")
+    content = BytesIO()
+    Image.fromarray(image).save(content, format="PNG")
+    return content.getvalue()
 
 
 def check_picture_path(path: Path) -> None:

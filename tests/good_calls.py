@@ -57,7 +57,14 @@ def good_calls(folder: Path) -> dict:
         "GradientDescent": (jd.GradientDescent, {"max_steps": 3}),
         "Implicit": (jd.Implicit, {"tolerance": 1e-3, "max_steps": 3, "throw": False}),
         "LBFGS": (jd.LBFGS, {"tolerance": 1e-3, "max_steps": 3}),
-        "Mesh": (jd.Mesh, {"vertices": MESH.vertices, "faces": MESH.faces}),
+        "Mesh": (
+            jd.Mesh,
+            {
+                "vertices": MESH.vertices,
+                "faces": MESH.faces,
+                "source": jd.load_mesh(obj).source,
+            },
+        ),
         "Newton": (jd.Newton, {"max_steps": 3}),
         "QuasiNewton": (
             jd.QuasiNewton,

@@ -15,6 +15,9 @@ PEER = 1e-6
 FD = 1e-4
 """Central differences, relative."""
 
+CASES = Path(__file__).parent / "cases"
+"""Small files as other programs write them."""
+
 REAL = Path(__file__).parents[2] / "shared" / "meshes"
 
 TWENTY = jd.Alternating(steps=20)

@@ -218,6 +218,7 @@ def wrong_values(kind: str, good, problem) -> dict:
         "cells": lambda: NO_MESH | {"none": 2, "problem": problem, "mesh": MESH},
         "problem": lambda: NO_MESH | {"mesh": MESH, "cells": CELLS, "class": jd.Problem},
         "path": lambda: NO_PATH,
+        "source": lambda: NO_SETTING | {"path": Path("a.obj"), "array": MESH.vertices},
         "axis": lambda: no_arrays(problem) | NO_AXIS,
         "dtype": lambda: NO_SETTING | {"half": np.float16, "integer": int, "name": "north"},
         "progress": lambda: {"text": "print", "number": 5, "mesh": MESH},

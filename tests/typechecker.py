@@ -13,7 +13,7 @@ PUBLIC = next(
 )
 PUBLIC |= {"bar", "cactus", "cylinder", "octopus", "square"}  # jd.shapes
 SETTINGS = {"Alternating", "GradientDescent", "Implicit", "LBFGS", "Newton", "QuasiNewton"}
-PUBLIC |= {f"{name}.__init__" for name in SETTINGS}
+PUBLIC |= {f"{name}.__init__" for name in {"Mesh", *SETTINGS}}
 
 
 def check(function):

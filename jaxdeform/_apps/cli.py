@@ -1,8 +1,8 @@
 """The command line: ``jaxdeform demo | inspect | deform | estimate``."""
 
+import errno
 import json
 import os
-import re
 import signal
 import sys
 import threading
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, TextIO, TypeVar, cast
 
 import jax
 import numpy as np
@@ -21,10 +21,12 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import jaxdeform as jd
-from jaxdeform._checks import check_rigidity
-from jaxdeform._errors import shown
-from jaxdeform._estimation.parts import check_parts
-from jaxdeform._mesh.files import check_output, check_place, write_atomically
+from jaxdeform._apps.arguments import make_folder, read_parts, read_pose, read_rigidity
+from jaxdeform._apps.mouth import Mouth
+from jaxdeform._apps.results import as_json, save_result
+from jaxdeform._errors import printable
+from jaxdeform._mesh.files import check_output, format_of, without_suffix
+from jaxdeform._mesh.writing import check_place, write_atomically
 from jaxdeform._plotting import check_picture_path
 
 app = typer.Typer(
@@ -34,7 +36,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 # Print file names unchanged: brackets are not markup, and lines are not wrapped.
-console = Console(highlight=False, markup=False, soft_wrap=True)
+mouth = Mouth()
+console = Console(file=cast(TextIO, mouth), highlight=False, markup=False, soft_wrap=True)
 
 Out = TypeVar("Out")
 
@@ -57,16 +60,36 @@ def main() -> None:
     """Run the command line. An InputError becomes one line on standard error and exit code 2."""
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
-        app()
+        try:
+            app()
+        finally:
+            mouth.flush()
+    except SystemExit as end:
+        if not end.code:
+            _tell_failure()
+        raise
     except jd.InputError as error:
         print(f"jaxdeform: {error}", file=sys.stderr)
         sys.exit(2)
+    except OSError as error:  # typer's own texts, such as --help
+        if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EIO):
+            raise
+        mouth.fail(error)
+        _tell_failure()
     except _Interrupted:
         print("jaxdeform: interrupted; no file was left half-written", file=sys.stderr)
         sys.stderr.flush()
         os._exit(130)  # do not wait for the worker thread
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _tell_failure() -> None:
+    """Say that the words about the work are lost, unless nobody wanted them."""
+    if mouth.failure and mouth.failure.errno != errno.EPIPE:
+        reason = mouth.failure.strerror
+        print(f"jaxdeform: standard output cannot be written ({reason})", file=sys.stderr)
+        sys.exit(1)
 
 
 def _patiently(what: str, work: Callable[[], Out]) -> Out:
@@ -96,7 +119,7 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("out"),
 ) -> None:
     """Bend a bar of soft, stiff and mixed material; write the deformed meshes and a picture."""
-    _make_folder(out)
+    make_folder(out)
     check_picture_path(out / "demo.png")
     mesh = jd.shapes.bar()
     y = mesh.vertices[:, 1]
@@ -171,11 +194,11 @@ def deform(
     """Move the handles of a mesh; the rest of it follows."""
     shape = jd.load_mesh(mesh)
     # Check all arguments before the long work.
-    check_output(out)
+    check_output(out, shape)
     if picture is not None:
         check_picture_path(picture)
     moves = jd.load_handles(handles, shape, motion)
-    values = _rigidity(rigidity, shape)
+    values = read_rigidity(rigidity, shape)
     began = time.perf_counter()
     problem = _patiently(
         "precomputing", lambda: jd.precompute(shape, moves.handles, cells=jd.rings(shape, rings))
@@ -187,17 +210,22 @@ def deform(
         "deforming",
         lambda: jd.deform(problem, moves.targets, values, solver=solver, normals=normals),
     )
+    # The result first, then words about it: whatever happens to those, the work is kept.
+    color = values if format_of(out) == ".ply" else None
+    save_result(out, shape, np.asarray(solution.vertices), color)
     energy, done = float(solution.energy[-1]), int(solution.steps)
     console.print(f"energy {energy:.6g} after {done} steps in {_since(began)}")
     console.print(jd.Result[solution.result])
-    color = values if out.suffix.lower() == ".ply" else None
-    jd.save_mesh(out, shape, vertices=np.asarray(solution.vertices), rigidity=color)
-    console.print(f"wrote {out}")
+    _say_wrote(out)
     if picture is not None:
         poses = [shape.vertices, np.asarray(solution.vertices)]
         colors = [None, values] if values.ndim else []
         jd.render(picture, shape, poses, titles=["rest", "deformed"], values=colors)
-        console.print(f"wrote {picture}")
+        _say_wrote(picture)
+
+
+def _say_wrote(*names: Path) -> None:
+    console.print(f"wrote {printable(' and '.join(map(str, names)))}")
 
 
 @app.command()
@@ -228,12 +256,12 @@ def estimate(
     """Estimate the rigidity of a mesh or of its parts from deformed poses."""
     shape = jd.load_mesh(rest)
     check_output(out)
-    report = out.with_suffix(".json")
-    if out.suffix.lower() != ".ply":
+    report = without_suffix(out).with_suffix(".json")
+    if format_of(out) != ".ply":
         raise jd.InputError(f"{out}: only PLY carries rigidity per vertex: use a .ply name")
     check_place(report)
-    observed = np.stack([_pose(path, shape, rest) for path in poses])
-    label = np.zeros(shape.n_vertices, int) if parts is None else _parts(parts, shape)
+    observed = np.stack([read_pose(path, shape, rest) for path in poses])
+    label = np.zeros(shape.n_vertices, int) if parts is None else read_parts(parts, shape)
     if handles is None:
         index = _moved_rigidly(shape, observed, tolerance)
     else:
@@ -249,13 +277,13 @@ def estimate(
             problem, observed, parts=label, solver=solver, progress=_show_evaluation
         ),
     )
+    jd.save_mesh(out, shape, rigidity=fit.field)
+    text = json.dumps(as_json(fit, index), indent=1, allow_nan=False)
+    write_atomically(report, f"{text}\n".encode())
     console.print(_part_table(fit, label))
     console.print(f"misfit {fit.misfit:.4g} after {len(fit.history)} evaluations, {_since(began)}")
     console.print(jd.Result[fit.result])
-    jd.save_mesh(out, shape, rigidity=fit.field)
-    text = json.dumps(_as_json(fit, index), indent=1, allow_nan=False)
-    write_atomically(report, lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
-    console.print(f"wrote {out} and {report}")
+    _say_wrote(out, report)
 
 
 def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.ndarray:
@@ -277,71 +305,6 @@ def _part_table(fit: jd.Estimate, label: np.ndarray) -> Table:
         size = str(int((label == k).sum()))
         table.add_row(str(k), size, f"{value:.4g}", f"{low:.4g} to {high:.4g}", fit.verdict[k])
     return table
-
-
-def _pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:
-    pose = jd.load_mesh(path)
-    if pose.n_vertices != rest.n_vertices or not np.array_equal(pose.faces, rest.faces):
-        raise jd.InputError(
-            f"{path}: is not a pose of {name}: {pose} and {rest} must have the same vertices and "
-            "faces, in the same order"
-        )
-    return pose.vertices
-
-
-def _parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        strange = re.search(r"\S*[^\s\d+-]\S*", text, re.ASCII)  # int() would take 1_0 for 10
-        is_json = path.suffix.lower() == ".json"
-        if strange and not is_json:
-            raise ValueError(f"{shown(strange[0])} is no whole number")
-        values = json.loads(text) if is_json else [int(word) for word in text.split()]
-        return check_parts(values, mesh.n_vertices)
-    except jd.InputError as error:
-        raise jd.InputError(f"{path}: {error}") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise jd.InputError(f"{path}: {error}: give one integer per vertex and line") from error
-
-
-def _as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
-    """Return the content of the report. JSON has no infinity, so null stands for it."""
-    finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
-    return {
-        "parts": [
-            {"rigidity": float(value), "interval": list(map(finite, pair)), "verdict": verdict}
-            for value, pair, verdict in zip(fit.rigidity, fit.interval, fit.verdict, strict=True)
-        ],
-        "misfit": finite(fit.misfit),
-        "history": list(map(finite, fit.history)),
-        "result": {"ok": fit.ok, "sentence": jd.Result[fit.result]},
-        "handles": handles.tolist(),
-    }
-
-
-def _rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
-    try:
-        values = np.asarray(float(text))
-    except ValueError:
-        if not Path(text).exists():
-            raise jd.InputError(
-                f"--rigidity {text}: is neither a number nor a file: give a number or a PLY file"
-            ) from None
-        values = jd.load_rigidity(text)
-    try:
-        check_rigidity(values, mesh.n_vertices, values.dtype)
-    except jd.InputError as error:
-        raise jd.InputError(f"--rigidity {text}: {error}") from error
-    return values
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise jd.InputError(
-            f"{folder}: cannot be made ({error.strerror}): choose another folder"
-        ) from error
 
 
 def _since(began: float) -> str:

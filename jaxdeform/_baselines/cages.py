@@ -30,8 +30,8 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "ver
 
     **Returns** (vertices, controls) weights.
 
-    **Raises** InputError: the cage is open or its faces are not oriented alike; a point is outside
-    the cage or not finite.
+    **Raises** InputError: the cage has faces without area; it is open or its faces are not
+    oriented alike; a point is outside the cage or not finite.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
@@ -42,6 +42,8 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "ver
     """
     check_type("cage", cage, Mesh)
     points = host_rows_of_three("vertices", vertices)
+    if len(cage.solid_faces) < cage.n_faces:
+        raise InputError("the cage has faces without area: drop them with jd.repair(cage)")
     _check_cage(points, cage)
     faces, corners = cage.faces, cage.vertices
     out = np.empty((len(points), len(corners)))

@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._checks import read_path
-from jaxdeform._errors import InputError
+from jaxdeform._errors import InputError, shown
+from jaxdeform._mesh.reading import read_text
+from jaxdeform._mesh.words import real, whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +55,7 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
     path = read_path("path", path)
     if path.suffix.lower() != ".tgf":
         raise InputError(f"{path}: skeletons are .tgf files, not '{path.suffix}'")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}): check the name") from error
+    lines = read_text(path).splitlines()
     joints: list[list[float]] = []
     bones: list[list[int]] = []
     section = 0
@@ -79,10 +78,11 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
 
 def _joint(where: str, words: list[str], expected: int) -> list[float]:
     try:
-        number, position = int(words[0]), [float(word) for word in words[1:]]
+        number, *_ = (whole(word.encode()) for word in words[:1])
+        position = [real(word.encode()) for word in words[1:]]
     except ValueError:
         raise InputError(
-            f"{where}: '{' '.join(words)}' is not a joint: give 'number x y z'"
+            f"{where}: {shown(' '.join(words))} is not a joint: give 'number x y z'"
         ) from None
     if number != expected or len(position) != 3 or not np.isfinite(position).all():
         raise InputError(f"{where}: expected joint {expected} as '{expected} x y z'")
@@ -91,9 +91,9 @@ def _joint(where: str, words: list[str], expected: int) -> list[float]:
 
 def _edge(where: str, words: list[str], count: int) -> list[int]:
     try:
-        i, j, *flags = (int(word) for word in words)
+        i, j, *flags = (whole(word.encode()) for word in words)
     except ValueError:
-        raise InputError(f"{where}: '{' '.join(words)}' is not an edge: give 'i j'") from None
+        raise InputError(f"{where}: {shown(' '.join(words))} is not an edge: give 'i j'") from None
     if not (1 <= i <= count and 1 <= j <= count):
         raise InputError(
             f"{where}: edge {i} {j} names a joint out of range: joints are 1 to {count}"

@@ -110,7 +110,7 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "ver
     """
     check_type("mesh", mesh, Mesh)
     index = check_handles(sources, mesh.n_vertices, name="source")
-    faces = np.ascontiguousarray(mesh.faces)
+    faces = np.ascontiguousarray(mesh.solid_faces)
     used = np.unique(faces)
     if not (igl.is_edge_manifold(faces)[0] and np.ravel(igl.is_vertex_manifold(faces))[used].all()):
         raise InputError("geodesic distances need a manifold surface: see jd.inspect(mesh)")
@@ -176,7 +176,7 @@ def bounded_biharmonic_weights(
     # Scale to unit size, because the tolerances of libigl are absolute.
     points = mesh.vertices - mesh.vertices.mean(axis=0)
     points = points / np.abs(points).max()
-    weights = igl.bbw(points, np.ascontiguousarray(mesh.faces), index, np.eye(count)[group])
+    weights = igl.bbw(points, np.ascontiguousarray(mesh.solid_faces), index, np.eye(count)[group])
     weights = np.clip(weights, 0.0, 1.0)
     total = weights.sum(axis=1, keepdims=True)
     if not np.isfinite(total).all() or total.min() < 0.1:

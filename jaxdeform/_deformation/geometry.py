@@ -74,14 +74,15 @@ def _graph_of(cells: Cells, dtype: np.dtype) -> Graph:
     count = np.diff(cells.membership.indptr)
     index = lambda x: jnp.asarray(np.ascontiguousarray(x), jnp.int32)  # noqa: E731
     low, high = mesh.edges.T
-    i, j = mesh.faces[:, [1, 2, 0]].T, mesh.faces[:, [2, 0, 1]].T
+    faces = mesh.solid_faces  # only these have edges
+    i, j = faces[:, [1, 2, 0]].T, faces[:, [2, 0, 1]].T
     keys = np.minimum(i, j) * mesh.n_vertices + np.maximum(i, j)
     return Graph(
         edges=index(mesh.edges.T),
         cell=index(np.repeat(np.arange(cells.n_vertices), count)),
         member=index(cells.membership.indices),
         overlap=jnp.asarray(cells.overlap, dtype),
-        faces=index(mesh.faces.T),
+        faces=index(faces.T),
         opposite=index(np.searchsorted(low * mesh.n_vertices + high, keys)),
         follows=jnp.asarray(cells.weights == cotangent_weights(mesh)),
     )

@@ -1,6 +1,5 @@
 """Handle files: JSON, and the .sel/.def pairs of the survey of Botsch and Sorkine (2008)."""
 
-import json
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from jaxdeform._checks import check_handles, check_type, read_path
 from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.reading import read_json, read_text
+from jaxdeform._mesh.words import real
 
 
 class HandleFile(NamedTuple):
@@ -75,20 +76,8 @@ def load_handles(
     return HandleFile(handles, targets)
 
 
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): check the name") from error
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not a text file: give a .json, .sel or .def file") from None
-
-
 def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        content = json.loads(_read_text(path))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error}): correct it there") from error
+    content = read_json(path)
     groups = content.get("handles") if isinstance(content, dict) else None
     if not isinstance(groups, list) or not groups:
         raise InputError(f'{path}: give {{"handles": [group, ...]}}, with at least one group')
@@ -110,7 +99,7 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 def _check_keys(where: str, given: dict, *known: str) -> None:
     unknown = sorted(set(given) - set(known))
     if unknown:
-        raise InputError(f"{where} has the unknown key '{unknown[0]}': use {', '.join(known)}")
+        raise InputError(f"{where} has the unknown key {shown(unknown[0])}: use {', '.join(known)}")
 
 
 def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
@@ -141,9 +130,12 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
 
 def _numbers(where: str, name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: {name}: give numbers") from None
+        array = np.asarray(value)
+    except ValueError:
+        array = np.asarray("")
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{where}: {name}: give numbers")
+    array = array.astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         size = f"{' x '.join(map(str, shape))} finite numbers" if shape else "one finite number"
         raise InputError(f"{where}: {name}: give {size}")
@@ -163,7 +155,13 @@ def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.
                 f"{path}: vertex {vertex} is {shown(word)}: give 0 (fixed), 1 (free) or 2 (handle)"
             )
     status = np.array(words)
-    matrix = _numbers(str(motion), "the matrix", _words(motion), (4, 4))
+    try:
+        rows = [[real(word.encode()) for word in row] for row in _words(motion)]
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{motion}: the matrix: give numbers") from None
+    matrix = _numbers(str(motion), "the matrix", rows, (4, 4))
     if matrix[3].tolist() != [0, 0, 0, 1]:
         raise InputError(
             f"{motion}: the matrix ends in the row {matrix[3].tolist()}: give 0 0 0 1 there, and "
@@ -178,5 +176,5 @@ def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.
 
 def _words(path: Path) -> list[list[str]]:
     """Return the words of each line; comments and empty lines are left out."""
-    rows = [line.split("#")[0].split() for line in _read_text(path).splitlines()]
+    rows = [line.split("#")[0].split() for line in read_text(path).splitlines()]
     return [row for row in rows if row]

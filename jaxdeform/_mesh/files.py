@@ -1,9 +1,11 @@
-"""Read and write mesh files. A file on disk is replaced as a whole or not at all."""
+"""Read and write mesh files."""
 
+import gzip
 import os
-import tempfile
-from collections.abc import Callable
+import warnings
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,24 +13,38 @@ from jaxtyping import Float, Int
 from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_rigidity, check_type, read_path
 from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._mesh.formats import FORMATS, ply_columns, to_ply
-from jaxdeform._mesh.mesh import Mesh, merge_equal_points
+from jaxdeform._mesh.formats import FORMATS
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.parsed import Source
+from jaxdeform._mesh.ply import rewrite_ply, to_ply, vertex_columns
+from jaxdeform._mesh.polygons import from_triangles, triangles
+from jaxdeform._mesh.reading import mark_of, read_bytes, without_mark
+from jaxdeform._mesh.stl import check_single_precision, is_binary
+from jaxdeform._mesh.writing import check_place, write_atomically
+
+# Cutting ears takes time by the square of the corners: 5,000 take two seconds.
+_MOST_CORNERS = 5_000
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
     """Read a mesh from an OBJ, OFF, PLY or STL file.
 
-    STL stores no shared vertices, so corners that are exactly equal are merged. Polygons with more
-    than three corners are refused: how to cut them is the modeller's choice. A file that holds less
-    than it announces is refused. An OBJ announces nothing unless :func:`save_mesh` or MeshLab
-    wrote it.
+    Polygons with more than three corners are cut into triangles for the work: a quad along its
+    shorter diagonal, any other with short diagonals that stay inside; one that is not planar, as
+    its shadow in its mean plane. The mesh remembers its file (:attr:`Mesh.source`), so that
+    :func:`save_mesh` writes the polygons, and all else that the file held, as they were.
 
-    **Arguments**: path, whose suffix names the format.
+    STL stores no shared vertices, so corners that are exactly equal are merged. A file that holds
+    less than it announces is refused; bytes behind its end are not (:func:`inspect` tells of
+    them). An OBJ announces nothing unless :func:`save_mesh` or MeshLab wrote it. Memory and time
+    are in proportion to the size of the file.
+
+    **Arguments**: path, whose suffix names the format. Behind it may stand ``.gz``.
 
     **Returns** the :class:`Mesh`, in the unit of the file.
 
-    **Raises** InputError: the file is missing, empty, truncated, unreadable or of another kind, or
-    its content is not a valid :class:`Mesh`.
+    **Raises** InputError: the file is missing, empty, truncated, unreadable or of another kind (a
+    pipe or a device, a point cloud), or its content is not a valid :class:`Mesh`.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -37,9 +53,10 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
         >>> jd.load_mesh(path)
         Mesh(722 vertices, 1440 faces)
     """
-    vertices, faces = read_arrays(read_path("path", path))
+    path = read_path("path", path)
+    vertices, faces, source = read_arrays(path)
     try:
-        return Mesh(vertices, faces)
+        return Mesh(vertices, faces, source=source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -53,8 +70,20 @@ def save_mesh(
 ) -> None:
     """Write a mesh as OBJ, OFF, PLY or STL; the suffix of the path chooses.
 
-    The file is written under a temporary name and then renamed, so an old file is either kept or
-    replaced as a whole. OBJ, OFF and PLY (binary) keep every bit; STL keeps single precision.
+    With ``.gz`` behind the suffix the file is compressed.
+
+    A mesh that :func:`load_mesh` read is written in the format of its file as that file with other
+    positions: polygons, texture coordinates, colours, groups, materials, values per face and
+    comments stay, and normals are computed anew. Without a change it is the same file, byte for
+    byte. In another format the polygons stay. For a plain file, write ``jd.Mesh(mesh.vertices,
+    mesh.faces)``. Files that the mesh names, such as an OBJ's ``mtllib``, are not copied.
+
+    OBJ, OFF, text STL and PLY keep every bit: a PLY's ``float`` positions become ``double`` if they
+    need more digits than ``float`` holds. Binary STL keeps single precision, with a warning if an
+    edge feels it.
+
+    The file is written under a temporary name, brought to the disk and then renamed, so an old file
+    is either kept or replaced as a whole. It keeps its permissions, and a symbolic link stays one.
 
     **Arguments**
 
@@ -63,8 +92,9 @@ def save_mesh(
     - vertices: (vertices, 3), the positions of a pose; by default the rest positions.
     - rigidity: a number or (vertices,), written as the vertex property ``rigidity`` (PLY only).
 
-    **Raises** InputError: the suffix is unknown; the folder cannot be written; a shape is wrong; a
-    position is not finite.
+    **Raises** InputError: the suffix is unknown; the folder cannot be written; the file is
+    read-only; a shape is wrong; a position is not finite; a rigidity is not finite or negative;
+    faces would collapse in STL's single precision.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -74,7 +104,7 @@ def save_mesh(
         array([0.5, 0.5])
     """
     path = read_path("path", path)
-    suffix = _suffix(path)
+    suffix = format_of(path)
     check_type("mesh", mesh, Mesh)
     points = mesh.vertices if vertices is None else vertices
     points = read_host_array(points, np.float64, "vertices")
@@ -94,10 +124,35 @@ def save_mesh(
             raise InputError(f"{path}: only PLY carries rigidity per vertex: use a .ply name")
         rigidity = read_host_array(rigidity, np.float64, "rigidity")
         rigidity = np.asarray(check_rigidity(rigidity, mesh.n_vertices, rigidity.dtype))
-        content = to_ply(points, mesh.faces, rigidity)
-    else:
-        content = FORMATS[suffix].to_bytes(points, mesh.faces)
-    write_atomically(path, lambda name: Path(name).write_bytes(content))
+    content = _content(path, suffix, mesh, points, rigidity)
+    if path.suffix.lower() == ".gz":
+        content = gzip.compress(content, mtime=0)
+    write_atomically(path, content)
+
+
+def _content(
+    path: Path, suffix: str, mesh: Mesh, points: np.ndarray, rigidity: np.ndarray | None
+) -> bytes:
+    source = mesh.source if mesh.source and mesh.source.suffix == suffix else None
+    if source and rigidity is None and np.array_equal(points, source.points):
+        return source.data
+    if _is_binary_stl(suffix, mesh):
+        loss = check_single_precision(path, points, mesh.faces)
+        if loss:
+            warnings.warn(loss, stacklevel=3)
+    to_bytes, rewrite = FORMATS[suffix].to_bytes, FORMATS[suffix].rewrite
+    if rigidity is not None:
+        to_bytes, rewrite = (
+            partial(to_ply, rigidity=rigidity),
+            partial(rewrite_ply, rigidity=rigidity),
+        )
+    if source is None:
+        kept = mesh.source.polygons if mesh.source else None
+        if kept is None or suffix == ".stl":
+            kept = from_triangles(mesh.faces)
+        return to_bytes(points, kept)
+    data = without_mark(source.data)
+    return mark_of(source.data) + rewrite(data, points, source.polygons)
 
 
 def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
@@ -118,9 +173,9 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
         (722,)
     """
     path = read_path("path", path)
-    if _suffix(path) != ".ply":
+    if format_of(path) != ".ply":
         raise InputError(f"{path}: rigidity is kept in .ply files only")
-    columns, _ = ply_columns(path, _read_bytes(path))
+    columns = vertex_columns(path, without_mark(read_bytes(path)))
     if "rigidity" not in columns:
         raise InputError(
             f"{path}: its vertices have no property 'rigidity' (only {', '.join(columns)}): write "
@@ -129,94 +184,69 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
     return columns["rigidity"]
 
 
-def read_arrays(
-    path: str | os.PathLike,
-) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Read vertices and faces as the file gives them, valid or not.
+class FileArrays(NamedTuple):
+    """What a file says of a mesh, valid or not."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    source: Source
+
+
+def read_arrays(path: Path) -> FileArrays:
+    """Read vertices and faces as the file gives them, valid or not; polygons are cut.
 
     libigl is not used, because it crashes the process on a truncated OBJ, never returns from an
     empty OFF, and silently drops incomplete lines. 50,000 vertices take 0.2 s.
 
     **Raises** InputError: the file is missing, empty, truncated or unreadable, its suffix is
-    unknown, or it holds polygons.
+    unknown, or it holds no faces.
     """
-    path = Path(path)
-    suffix = _suffix(path)
-    vertices, faces = FORMATS[suffix].parse(path, _read_bytes(path))
-    if not len(faces):
-        raise InputError(f"{path}: holds no triangles: export it as a triangle mesh")
-    if suffix == ".stl":
-        vertices, merged = merge_equal_points(vertices)
-        faces = merged[faces]
-    return vertices, faces
-
-
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise InputError(f"{path}: unknown suffix '{path.suffix}': use one of {', '.join(FORMATS)}")
-    return suffix
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): check the name") from error
-    if not data.strip():
-        raise InputError(f"{path}: is empty: export the mesh again")
-    return data.removeprefix(b"\xef\xbb\xbf")
-
-
-def write_atomically(path: Path, write: Callable[[str], object]) -> None:
-    """Call ``write(name)`` on a temporary file in the same folder, then rename it to ``path``.
-
-    **Raises** InputError if the folder cannot be written. An old file is then kept.
-    """
-    path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(suffix=path.suffix, prefix=".writing-", dir=path.parent)
-    except OSError as error:
+    suffix = format_of(path)
+    data = read_bytes(path)
+    with np.errstate(invalid="ignore"):  # what is not finite is refused later
+        points, polygons, trailing = FORMATS[suffix].parse(path, without_mark(data))
+    if not len(polygons.sizes):
         raise InputError(
-            f"{path}: cannot write there ({error.strerror}): check the folder"
-        ) from error
-    os.close(handle)
-    try:
-        write(name)
-        mode = path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask()
-        os.chmod(name, mode)
-        os.replace(name, path)
-    except OSError as error:
+            f"{path}: holds {len(points)} points and no faces: make a surface of them first"
+        )
+    largest = int(polygons.sizes.max())
+    if largest > _MOST_CORNERS:
         raise InputError(
-            f"{path}: cannot write there ({error.strerror}): choose another name"
-        ) from error
-    finally:
-        Path(name).unlink(missing_ok=True)
+            f"{path}: face {polygons.sizes.argmax()} has {largest} corners: cut it into triangles "
+            "in a modeller; here that would take too long"
+        )
+    points.setflags(write=False)
+    source = Source(suffix, data, polygons, trailing, points)
+    return FileArrays(points, triangles(points, polygons), source)
 
 
-def check_output(path: str | os.PathLike) -> None:
-    """Raise InputError if the suffix is unknown or the folder cannot be written.
+def format_of(path: Path) -> str:
+    """Return the suffix of the format, without the ``.gz`` behind it."""
+    suffix = Path(path.stem).suffix if path.suffix.lower() == ".gz" else path.suffix
+    if suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: unknown suffix '{suffix}': use one of {', '.join(FORMATS)}")
+    return suffix.lower()
+
+
+def check_output(path: str | os.PathLike, mesh: Mesh | None = None) -> None:
+    """Raise InputError if a file, or this mesh at rest, cannot be written under this name.
 
     Example:
         >>> from jaxdeform._mesh.files import check_output
         >>> check_output("bent.ply")
     """
     path = Path(path)
-    _suffix(path)
+    suffix = format_of(path)
     check_place(path)
+    if mesh and _is_binary_stl(suffix, mesh):
+        check_single_precision(path, mesh.vertices, mesh.faces)
 
 
-def check_place(path: Path) -> None:
-    """Raise InputError if no file can be written at this path."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder: give the name of a file")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: cannot write there: make the folder {path.parent} first")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError(f"{path}: the folder {path.parent} cannot be written: choose another")
+def without_suffix(path: Path) -> Path:
+    """Return the path without the suffix of the format, and without ``.gz``."""
+    return (path.with_suffix("") if path.suffix.lower() == ".gz" else path).with_suffix("")
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _is_binary_stl(suffix: str, mesh: Mesh) -> bool:
+    text = mesh.source and mesh.source.suffix == ".stl" and not is_binary(mesh.source.data)
+    return suffix == ".stl" and not text

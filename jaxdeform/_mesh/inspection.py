@@ -11,6 +11,7 @@ from jaxdeform._checks import read_path
 from jaxdeform._errors import ArrayLike, InputError, a_or_an
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
+    NO_AREA,
     Mesh,
     checked_arrays,
     connected_components,
@@ -18,21 +19,22 @@ from jaxdeform._mesh.mesh import (
     merge_equal_points,
     unique_edges,
 )
+from jaxdeform._mesh.parsed import Source
 
 # A broken mesh cannot become a Mesh, so the functions below take it in any of three forms.
 MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike
 
 
-def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike]:
+def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike, Source | None]:
     if isinstance(mesh, Mesh):
-        return mesh.vertices, mesh.faces
+        return mesh.vertices, mesh.faces, mesh.source
     if isinstance(mesh, str | os.PathLike):
         return read_arrays(read_path("mesh", mesh))
     if not isinstance(mesh, list | tuple) or len(mesh) != 2:
         raise InputError(
             f"mesh is {a_or_an(mesh)}: give a Mesh, a pair (vertices, faces), or the path of a file"
         )
-    return mesh[0], mesh[1]
+    return mesh[0], mesh[1], None
 
 
 def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
@@ -52,7 +54,7 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
         >>> mesh, new.tolist()
         (Mesh(3 vertices, 1 faces), [0, 1, 2, 2, -1])
     """
-    points, faces = checked_arrays(*_arrays(mesh))
+    points, faces = checked_arrays(*_arrays(mesh)[:2])
     points, merged = merge_equal_points(points)
     faces = merged[faces]
     faces = np.delete(faces, [face for _, face in degenerate_faces(points, faces)], axis=0)
@@ -98,28 +100,40 @@ def inspect(mesh: MeshLike) -> Inspection:
         >>> jd.inspect(jd.shapes.bar()).findings
         ()
     """
-    arrays = _arrays(mesh)
-    try:
-        points, faces = checked_arrays(*arrays)
-    except InputError as error:
-        return Inspection({}, (f"Unusable: {error}",))
-    n, m = len(points), len(faces)
+    vertices, faces, source = _arrays(mesh)
     findings: list[str] = []
 
     def report(count: int, what: str, move: str) -> None:
         if count:
             findings.append(f"{count} {what}: {move}")
 
+    if source:
+        polygons = int((source.polygons.sizes > 3).sum())
+        report(
+            polygons,
+            "faces have more than three corners",
+            "cut into triangles for the work, kept as they are in a file of the same mesh",
+        )
+        report(source.trailing, "bytes follow the end of the mesh", "they are not read")
+    try:
+        points, faces = checked_arrays(vertices, faces)
+    except InputError as error:
+        return Inspection({}, (f"Unusable: {error}", *findings))
+    n, m = len(points), len(faces)
     bad = degenerate_faces(points, faces)
-    repeating = [k for reason, k in bad if reason.startswith("repeats")]
-    flat = [k for reason, k in bad if reason.startswith("has")]
+    repeating = [k for reason, k in bad if reason != NO_AREA]
+    flat = [k for reason, k in bad if reason == NO_AREA]
     remedy = "jd.repair drops them"
     report(len(repeating), f"faces repeat a vertex (face {(repeating or [0])[0]})", remedy)
-    report(len(flat), f"faces have no area (face {(flat or [0])[0]})", remedy)
+    report(
+        len(flat),
+        f"faces have no area (face {(flat or [0])[0]})",
+        f"their edges weigh nothing; {remedy}",
+    )
     sound = np.delete(faces, [k for _, k in bad], axis=0)
     sound = sound[np.unique(np.sort(sound, axis=1), axis=0, return_index=True)[1]]
-    unreferenced = n - len(np.unique(faces))
-    report(unreferenced, "vertices belong to no face", "they stay where they are")
+    unreferenced = n - len(np.unique(np.delete(faces, flat, axis=0)))
+    report(unreferenced, "vertices belong to no face with an area", "they stay where they are")
     duplicates = n - len(np.unique(points, axis=0))
     report(
         duplicates,
@@ -130,8 +144,9 @@ def inspect(mesh: MeshLike) -> Inspection:
     report(repeated, "faces are repeated", "their edges weigh double; jd.repair drops them")
     counts: dict[str, int | float] = {"vertices": n, "faces": m}
     if len(sound):
-        _inspect_structure(points, sound, counts, report)
-        _inspect_angles(points, sound, counts, report)
+        with np.errstate(all="ignore"):  # numbers near the ends of the range of float64
+            _inspect_structure(points, sound, counts, report)
+            _inspect_angles(points, sound, counts, report)
     return Inspection(counts, tuple(findings))
 
 

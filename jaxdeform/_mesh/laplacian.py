@@ -38,7 +38,7 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
     # Scale first, because libigl squares areas: a mesh 1e-90 wide would underflow.
     vertices = mesh.vertices - mesh.vertices.mean(axis=0)
     vertices = vertices / np.abs(vertices).max()
-    matrix = igl.cotmatrix(vertices, mesh.faces).tocsr()
+    matrix = igl.cotmatrix(vertices, mesh.solid_faces).tocsr()
     i, j = mesh.edges.T
     return np.asarray(matrix[i, j]).ravel()
 

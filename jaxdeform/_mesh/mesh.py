@@ -2,19 +2,23 @@
 
 import hashlib
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
 from jaxdeform._arrays import read_host_array, read_integers
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.parsed import Source
 
 # A triangle has no area if its height is below this fraction of its longest edge: float64 cannot
 # tell such an area from rounding, and the cotangents would be noise. Thin but real triangles
 # (0.4 degrees) lie a factor of 1e10 above it.
 _FLAT = 1e-13
+
+NO_AREA = "has no area"
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -22,7 +26,9 @@ class Mesh:
     """A triangle mesh, checked once when it is made, then frozen.
 
     Open borders, several connected components, unreferenced vertices, non-manifold edges and
-    vertices, and inward-facing faces are all allowed; :func:`inspect` reports them.
+    vertices, inward-facing faces, and faces without area are all allowed; :func:`inspect` reports
+    them. A face without area is kept for files and pictures, but its edges weigh nothing, as in
+    other ARAP programs: a vertex that has no other face stays where it is.
 
     A mesh is a value. Two meshes with the same numbers are equal and have the same hash, even after
     pickling or in another process. The arrays are read-only: copy one before you change it. Some
@@ -33,10 +39,11 @@ class Mesh:
 
     - vertices: (vertices, 3), in any unit of length.
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
+    - source: what :func:`load_mesh` remembers of a file with these faces, for :func:`save_mesh`.
 
     **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (there are no
     derivatives to the rest shape); a vertex is not finite; a face index is out of range; a face
-    repeats a vertex or has no area (:func:`repair` drops those).
+    repeats a vertex, or none has an area (:func:`repair`); the source has other faces.
 
     Example:
         >>> import jaxdeform as jd
@@ -48,18 +55,36 @@ class Mesh:
     """Positions, in any unit of length."""
     faces: Int[np.ndarray, "faces 3"]
     """Vertex indices, counter-clockwise seen from outside."""
+    solid_faces: Int[np.ndarray, "solid 3"]
+    """The faces that have an area. Only these have edges, and so a part in the energy."""
+    source: Source | None
+    """The file that the mesh was read from, so that it can be written with other positions. It is
+    pickled with the mesh, but meshes with the same numbers are equal whatever file they are from:
+    it changes no result."""
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, *, source: Source | None = None
+    ) -> None:
         """Copy, check and freeze the arrays."""
         vertices, faces = checked_arrays(vertices, faces)
-        for reason, face in degenerate_faces(vertices, faces):
-            raise InputError(
-                f"face {face} {faces[face].tolist()} {reason}: drop such faces with "
-                "jd.repair((vertices, faces))"
-            )
-        for name, array in (("vertices", vertices), ("faces", faces)):
+        if source is not None:
+            check_type("source", source, Source)
+            if not source.fits(len(vertices), faces):
+                raise InputError(
+                    "source is of a mesh with other faces: leave it out, and the file will be new"
+                )
+        bad = degenerate_faces(vertices, faces)
+        for reason, face in bad:
+            if reason != NO_AREA or len(bad) == len(faces):
+                raise InputError(
+                    f"face {face} {faces[face].tolist()} {reason}: drop such faces with "
+                    "jd.repair((vertices, faces))"
+                )
+        solid = np.delete(faces, [face for _, face in bad], axis=0) if bad else faces
+        for name, array in (("vertices", vertices), ("faces", faces), ("solid_faces", solid)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        object.__setattr__(self, "source", source)
 
     @property
     def n_vertices(self) -> int:
@@ -73,14 +98,14 @@ class Mesh:
 
     @cached_property
     def edges(self) -> Int[np.ndarray, "edges 2"]:
-        """Undirected edges (i < j), each once, in ascending order."""
-        return unique_edges(self.faces)
+        """Undirected edges (i < j) of faces with an area, each once, in ascending order."""
+        return unique_edges(self.solid_faces)
 
     @cached_property
     def referenced(self) -> Bool[np.ndarray, "vertices"]:
-        """True for each vertex that belongs to a face."""
+        """True for each vertex that belongs to a face with an area."""
         mask = np.zeros(self.n_vertices, bool)
-        mask[self.faces.ravel()] = True
+        mask[self.solid_faces.ravel()] = True
         return mask
 
     @cached_property
@@ -90,12 +115,12 @@ class Mesh:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the bounding box of the vertices that belong to a face."""
+        """Diagonal of the bounding box of the referenced vertices."""
         return float(np.linalg.norm(np.ptp(self.vertices[self.referenced], axis=0)))
 
     @cached_property
     def center(self) -> Float[np.ndarray, "3"]:
-        """Mean of the vertices that belong to a face."""
+        """Mean of the referenced vertices."""
         return self.vertices[self.referenced].mean(axis=0)
 
     @cached_property
@@ -112,8 +137,8 @@ class Mesh:
         return hash(self.digest)
 
     def __reduce__(self):
-        """Pickle the two arrays; loading checks and freezes them again."""
-        return Mesh, (self.vertices, self.faces)
+        """Pickle the arrays and the source; loading checks and freezes the arrays again."""
+        return partial(Mesh, source=self.source), (self.vertices, self.faces)
 
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
@@ -158,7 +183,7 @@ def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, i
     size = np.where(longest > 0, longest, 1.0)[:, None]
     area = np.linalg.norm(np.cross(u / size, v / size), axis=1)
     flat = (area <= _FLAT) & ~repeats
-    return found + [("has no area", int(k)) for k in np.flatnonzero(flat)]
+    return found + [(NO_AREA, int(k)) for k in np.flatnonzero(flat)]
 
 
 def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:

@@ -88,7 +88,7 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     index = np.union1d(kept, np.flatnonzero(is_free))
     new = np.full(mesh.n_vertices, -1)
     new[index] = np.arange(len(index))
-    faces = new[mesh.faces]
+    faces = new[mesh.solid_faces]
     faces = faces[(faces >= 0).all(axis=1)]
     if not len(faces):
         raise InputError("the free vertices belong to no face: free a vertex that does")

@@ -13,7 +13,9 @@ import pytest
 from PIL import Image
 
 import jaxdeform as jd
+from jaxdeform._apps.arguments import read_pose
 from jaxdeform._apps.cli import main
+from jaxdeform._mesh.files import without_suffix
 
 
 @pytest.fixture
@@ -130,7 +132,7 @@ def test_inspect(run, files):
     (files / "flat.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n")
     code, out, _ = run("inspect", files / "flat.off")
     assert code == 0
-    assert "1 faces have no area (face 0): jd.repair drops them" in out
+    assert "1 faces have no area (face 0): their edges weigh nothing; jd.repair drops them" in out
     code, out, err = run("inspect", files / "none[b].off")
     assert (code, out) == (2, "")
     assert err == f"jaxdeform: {files}/none[b].off: cannot be read " + (
@@ -140,6 +142,7 @@ def test_inspect(run, files):
 
 MISTAKES = {
     "is neither a number nor": {"--rigidity": "soft"},
+    "--rigidity 1_0: is neither a number nor a file": {"--rigidity": "1_0"},
     "--rigidity nan: rigidity is nan: it must be": {"--rigidity": "nan"},
     "--rigidity -1: rigidity is -1.0": {"--rigidity": "-1"},
     "inf": {"--rigidity": "inf"},
@@ -265,3 +268,131 @@ def test_ctrl_c_leaves_old_files_whole(files):
     assert err == "jaxdeform: interrupted; no file was left half-written\n"
     assert (files / "out.ply").read_text() == "old"
     assert sorted(os.listdir(files)) == before
+
+
+def spoken_to(files, target, *arguments):
+    """Run the command with its output closed or on a full disk: exit code and errors."""
+    command = [Path(sys.executable).parent / "jaxdeform", *arguments]
+    if target == "closed":
+        reader, writer = os.pipe()
+        os.close(reader)
+    else:
+        writer = os.open("/dev/full", os.O_WRONLY)
+    try:
+        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(writer)
+    return done.returncode, done.stderr
+
+
+FULL = "jaxdeform: standard output cannot be written (No space left on device)\n"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has such a device")
+@pytest.mark.parametrize(("target", "end"), [("closed", (0, "")), ("full", (1, FULL))])
+def test_the_result_is_written_though_nobody_listens(files, target, end):
+    out = files / "out.ply"
+    found = spoken_to(
+        files, target, "deform", files / "bar.off", "--handles", files / "bend.json",
+        "--rigidity", "1", "-o", out, "--steps", "1",
+    )  # fmt: skip
+    assert found == end
+    assert jd.load_mesh(out).n_vertices == 722
+    assert spoken_to(files, target, "inspect", out) == end
+
+
+def test_a_mesh_of_quads_comes_back_as_quads(run, files):
+    """With what else the file held."""
+    lines = [f"v {x} {y} {0.1 * x * y} 0.5 0.5 0.5" for x in range(4) for y in range(4)]
+    lines += [f"f {k}/{k} {k + 4}/{k} {k + 5}/{k} {k + 1}/{k}" for k in range(1, 12) if k % 4]
+    old = "\n".join(["mtllib a.mtl", "usemtl b", *[f"vt 0 {k}" for k in range(12)], *lines])
+    (files / "grid.obj").write_text(old)
+    ends_ = {"vertices": [0, 1, 2, 3]}, {"vertices": [12, 13, 14, 15], "translation": [0, 0, 2]}
+    (files / "lift.json").write_text(json.dumps({"handles": ends_}))
+    code, _, err = run(
+        "deform", files / "grid.obj", "--handles", files / "lift.json", "--rigidity", 1,
+        "-o", files / "out.obj",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    new = (files / "out.obj").read_text()
+    others = lambda text: [line for line in text.split("\n") if line[:2] != "v "]  # noqa: E731
+    assert others(new) == others(old)
+    assert new.count(" 0.5 0.5 0.5") == 16
+
+
+def test_a_pose_may_be_cut_along_other_diagonals(tmp_path):
+    quad = "OFF\n4 1 0\n0 0 0\n{} 0 0\n1 {} 0\n0 1 0\n4 0 1 2 3\n"
+    for name, x, y in (("rest", 1, 1.5), ("pose", 1.5, 1)):
+        (tmp_path / f"{name}.off").write_text(quad.format(x, y))
+    rest, pose = (jd.load_mesh(tmp_path / f"{name}.off") for name in ("rest", "pose"))
+    assert rest.faces.tolist() != pose.faces.tolist()
+    found = read_pose(tmp_path / "pose.off", rest, tmp_path / "rest.off")
+    np.testing.assert_array_equal(found, pose.vertices)
+    jd.save_mesh(tmp_path / "turned.off", jd.Mesh(rest.vertices, rest.faces[:, ::-1]))
+    with pytest.raises(jd.InputError, match=r"turned\.off: is not a pose of"):
+        read_pose(tmp_path / "turned.off", rest, tmp_path / "rest.off")
+
+
+def test_the_report_beside_a_compressed_file(tmp_path):
+    for name in ("fit.ply", "fit.ply.gz", "fit.PLY.GZ"):
+        assert without_suffix(tmp_path / name) == tmp_path / "fit"
+
+
+def test_what_stl_cannot_hold_is_refused_before_the_work_and_rescued_after(run, files, bar):
+    far = jd.Mesh(bar.vertices + 1e9, bar.faces)
+    jd.save_mesh(files / "far.off", far)
+    arguments = "--handles", files / "bend.json", "--rigidity", 1, "--steps", 1
+    code, out, err = run("deform", files / "far.off", *arguments, "-o", files / "far.stl")
+    assert (code, out) == (2, "")
+    assert "far.stl: not written: STL keeps single precision" in err
+    # Here only the pose is far away.
+    y = bar.vertices[:, 1]
+    low = [int(k) for k in np.flatnonzero(y < 6)]
+    groups = [{"vertices": low, "translation": [1e9, 0, 0]}]
+    (files / "away.json").write_text(json.dumps({"handles": groups}))
+    code, out, err = run(
+        "deform", files / "bar.off", "--handles", files / "away.json", "--rigidity", 1,
+        "--steps", 1, "-o", files / "bent.stl",
+    )  # fmt: skip
+    assert code == 2
+    assert "bent.stl: not written: STL keeps single" in err
+    assert err.endswith(f"; the result is in {files}/bent.rescued.ply\n")
+    assert jd.load_mesh(files / "bent.rescued.ply").n_vertices == 722
+
+
+def test_bad_files_of_parts(run, files, bar):
+    texts = {
+        "parts have shape (3,): give one integer per vertex, (722,)": "0 1 0",
+        "the part of vertex 0 is '1_0': give an integer": "1_0 " * 722,
+        "the part of vertex 1 is 1000000000, out of range": "0 1000000000 " * 361,
+        "the part of vertex 0 is '-0.5'": "-0.5 " * 722,
+        "the part of vertex 2 is -1": "0 0 -1 " + "0 " * 719,
+        "the part of vertex 0 is '" + "9" * 50: "9" * 5000 + " 0" * 721,
+        "no vertex belongs to part 0": "1 " * 722,
+    }
+    lists = {
+        "the part of vertex 0 is 0.5": [0.5, 1.7] * 361,
+        "the part of vertex 1 is True": [0, True] * 361,
+        "the part of vertex 0 is [0]": [[0]] * 722,
+        "give a list of one integer per vertex": {"0": 1},
+        "is not valid JSON": None,
+    }
+    for suffix, cases in ((".txt", texts), (".json", lists)):
+        for message, content in cases.items():
+            path = files / f"parts{suffix}"
+            text = content if suffix == ".txt" else json.dumps(content)
+            path.write_text("[" * 100_000 if content is None else str(text))
+            code, out, err = run(
+                "estimate", files / "bar.off", files / "bar.off", "-o", files / "o.ply",
+                "--parts", path,
+            )  # fmt: skip
+            assert (code, out) == (2, ""), message
+            assert f"parts{suffix}: {message}" in err
+            assert len(err) < 1100
+    # A byte-order mark does no harm, and neither do very long numbers.
+    path = files / "parts.json"
+    path.write_text("[" + ",".join(["9" * 5000] * 722) + "]", encoding="utf-8-sig")
+    code, _, err = run("estimate", files / "bar.off", files / "bar.off", "-o", files / "o.ply",
+                       "--parts", path)  # fmt: skip
+    assert code == 2
+    assert "parts.json: is not valid JSON (Exceeds the limit" in err

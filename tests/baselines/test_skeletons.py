@@ -22,9 +22,11 @@ def test_reading_a_skeleton(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no bones"),
+        ("", "is empty"),
         ("1 0 0 0\n2 1 1 1\n1 2\n", "line 3: expected joint 3"),
         ("1 0 0 0\n2 1 1 1\n#\n", "no bones"),
+        ("1 0 0 0\n2 1 1 1_0\n#\n1 2\n", "line 2: '2 1 1 1_0' is not a joint"),
+        ("1 0 0 0\n2 1 1 1\n#\n1 0_2\n", "line 4: '1 0_2' is not an edge"),
         ("1 0 0\n#\n", "line 1: expected joint 1"),
         ("1 0 0 nan\n#\n", "line 1: expected joint 1"),
         ("1 0 0 zero\n#\n", "line 1: '1 0 0 zero' is not a joint"),

@@ -1,6 +1,7 @@
 """Handle files: targets against scipy's matrix exponential, and every way to write one wrongly."""
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -101,7 +102,8 @@ def test_bad_groups_are_named(tmp_path, bar, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "is not valid JSON .*line 1 column 1"),
+        (b"", "is empty"),
+        (b"x", "is not valid JSON .*line 1 column 1"),
         (b'{"handles": [{"vertices": [0, 1]}', "is not valid JSON"),
         (b"[" * 100_000, "is not valid JSON"),
         (b"[1, 2]", r'give {"handles": \[group'),
@@ -109,6 +111,18 @@ def test_bad_groups_are_named(tmp_path, bar, message):
         (b'{"handles": {}}', r'give {"handles": \[group'),
         (b'{"handles": []}', "with at least one group"),
         (b"\xff\xfe\x00", "is not a text file"),
+        (b'{"handles": [{"vertices": [' + b"9" * 5000 + b"]}]}", "is not valid JSON .Exceeds"),
+        (
+            b'{"handles": [{"vertices": [' + b"9" * 400 + b"]}]}",
+            "handles cannot be read as numbers",
+        ),
+        (
+            b'{"handles": [{"vertices": [0], "translation": [0, 0, ' + b"9" * 400 + b"]}]}",
+            "translation: give numbers",
+        ),
+        (b'{"handles": [{"vertices": [0], "translation": ["1_0", 0, 0]}]}', "give numbers"),
+        (b'{"handles": [{"vertices": [1000000000]}]}', "handle 1000000000 .* out of range"),
+        (b'{"handles": [{"vertices": [0], "\\u001b[31m' + b"a" * 9999 + b'": 1}]}', "unknown key"),
     ],
 )
 def test_bad_json_is_named(tmp_path, bar, content, message):
@@ -117,6 +131,8 @@ def test_bad_json_is_named(tmp_path, bar, content, message):
     with pytest.raises(jd.InputError, match=message) as error:
         jd.load_handles(path, bar)
     assert str(path) in str(error.value)
+    assert str(error.value).isprintable()
+    assert len(str(error.value)) < 1000
 
 
 def test_a_byte_order_mark_does_no_harm(tmp_path, bar):
@@ -161,6 +177,7 @@ def test_bad_survey_files_are_named(tmp_path):
         "h.sel: no handles": ("1 " * 9, MATRIX),
         "h.def: the matrix: give 4 x 4 finite numbers": (good, MATRIX[:-8]),
         "h.def: the matrix: give numbers": (good, MATRIX + "1\n"),
+        r"h\.def: the matrix: give numbers": (good, MATRIX.replace("10", "1_0")),
         "h.def: the matrix: give 4 x 4 finite": (good, MATRIX.replace("10", "inf")),
         "h.def: the matrix ends in the row": (good, "1 0 0 0\n0 1 0 0\n0 0 1 0\n1 2 3 1\n"),
     }
@@ -204,3 +221,17 @@ def test_the_survey_s_cylinder():
     # The file says so: 120 degrees about y, to six digits, and a shift.
     turn = turned(v[~fixed], [0, -1, 0], 120, np.zeros(3)) + np.array([5.196152, 0, 9])
     np.testing.assert_allclose(targets[~fixed], turn, atol=1e-5)
+
+
+def test_a_long_word_takes_no_more_memory_than_it_is_long(tmp_path):
+    """An array of words would give each the room of the longest: here 400 MB."""
+    mesh = jd.shapes.cylinder()
+    words = ["1"] * mesh.n_vertices
+    words[7] = "x" * 20_000
+    path = survey(tmp_path, " ".join(words))
+    tracemalloc.start()
+    with pytest.raises(jd.InputError, match="vertex 7 is 'xxx"):
+        jd.load_handles(path, mesh)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 30 * path.stat().st_size

@@ -1,15 +1,15 @@
-"""Files: round trips, and what is on disk stays whole."""
+"""Files: round trips, compressed ones, what is no file."""
 
+import gzip
 import os
-import stat
-from pathlib import Path
+import tracemalloc
 
 import numpy as np
 import pytest
 from helpers import replaced
 
 import jaxdeform as jd
-from jaxdeform._mesh.files import check_output, write_atomically
+from jaxdeform._mesh.files import check_output
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".OFF"])
@@ -47,22 +47,25 @@ def test_a_failing_write_leaves_the_old_file(tmp_path, odd, monkeypatch):
     jd.save_mesh(path, odd)
     before = path.read_bytes()
 
-    def half(error):
-        def write(name):
-            Path(name).write_bytes(before[:50])
+    def failing(error):
+        def fail(*_):
             raise error
 
-        return write
+        return fail
 
-    with pytest.raises(jd.InputError, match="No space left on device"):
-        write_atomically(path, half(OSError(28, "No space left on device")))
+    def save():
+        jd.save_mesh(path, odd, vertices=odd.vertices + 1)
+
+    for name in ("fsync", "replace", "open"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, failing(OSError(28, "No space left on device")))
+            with pytest.raises(jd.InputError, match="No space left on device"):
+                save()
     for error in (RuntimeError, KeyboardInterrupt):
-        with pytest.raises(error):
-            write_atomically(path, half(error()))
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError(18, "no link")))
-        with pytest.raises(jd.InputError, match="no link"):
-            jd.save_mesh(path, odd, vertices=odd.vertices + 1)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", failing(error()))
+            with pytest.raises(error):
+                save()
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["m.ply"]
 
@@ -76,6 +79,9 @@ def test_bad_arguments_leave_the_old_file(tmp_path, odd):
         r"vertices have shape \(7, 3\)": {"vertices": odd.vertices[1:]},
         "vertex 3 is .*nan": {"vertices": nan},
         r"rigidity has shape \(2,\)": {"rigidity": [1.0, 2.0]},
+        "rigidity is nan: it must be": {"rigidity": np.nan},
+        "rigidity is -1.0 at vertex 7": {"rigidity": replaced(np.ones(8), 7, -1.0)},
+        "rigidity is inf at vertex 2": {"rigidity": replaced(np.ones(8), 2, np.inf)},
     }.items():
         with pytest.raises(jd.InputError, match=message):
             jd.save_mesh(path, odd, **settings_)
@@ -104,11 +110,106 @@ def test_a_folder_without_permission(tmp_path, odd):
     tmp_path.chmod(0o755)
 
 
-def test_a_new_file_has_the_usual_permissions_and_an_old_one_keeps_its_own(tmp_path, odd):
-    (tmp_path / "plain").touch()
-    path = tmp_path / "m.off"
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".stl"])
+def test_compressed_files(tmp_path, bar, suffix):
+    plain, packed = tmp_path / f"m{suffix}", tmp_path / f"m{suffix}.GZ"
+    jd.save_mesh(plain, bar)
+    jd.save_mesh(packed, bar)
+    assert gzip.decompress(packed.read_bytes()) == plain.read_bytes()
+    # Files may be put together.
+    whole = plain.read_bytes()
+    packed.write_bytes(gzip.compress(whole[:999]) + gzip.compress(whole[999:]))
+    assert jd.load_mesh(packed) == jd.load_mesh(plain)
+    if suffix == ".ply":
+        jd.save_mesh(packed, bar, rigidity=2.0)
+        np.testing.assert_array_equal(jd.load_rigidity(packed), np.full(722, 2.0))
+
+
+def test_damaged_compressed_files(tmp_path, odd):
+    path = tmp_path / "m.off.gz"
     jd.save_mesh(path, odd)
-    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
-    path.chmod(0o640)
-    jd.save_mesh(path, odd)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    data = path.read_bytes()
+    for size in range(len(data)):
+        path.write_bytes(data[:size])
+        with pytest.raises(jd.InputError, match=r"cannot be decompressed|is empty"):
+            jd.load_mesh(path)
+    path.write_bytes(b"OFF\n")
+    with pytest.raises(jd.InputError, match="cannot be decompressed"):
+        jd.load_mesh(path)
+    with pytest.raises(jd.InputError, match=r"unknown suffix ''"):
+        jd.load_mesh(tmp_path / "m.gz")
+
+
+def test_a_file_made_to_fill_the_memory_is_refused(tmp_path):
+    path = tmp_path / "m.obj.gz"
+    path.write_bytes(gzip.compress(bytes(30_000_000)))
+    tracemalloc.start()
+    with pytest.raises(jd.InputError, match="more than 200 times as long when decompressed"):
+        jd.load_mesh(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # The result, and a copy of it while it is put together.
+    assert peak < 3 * 200 * path.stat().st_size
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has none")
+@pytest.mark.parametrize("door", [jd.load_mesh, jd.load_rigidity, jd.inspect, jd.repair])
+def test_pipes_and_devices_are_refused(tmp_path, door):
+    os.mkfifo(tmp_path / "pipe.ply")
+    (tmp_path / "zero.ply").symlink_to("/dev/zero")
+    for name in ("pipe.ply", "zero.ply"):
+        with pytest.raises(jd.InputError, match="it is a pipe or a device"):
+            door(tmp_path / name)
+
+
+@pytest.mark.parametrize("door", [jd.load_mesh, jd.inspect, check_output])
+def test_a_name_that_no_file_can_have(tmp_path, door):
+    for name in (f"{tmp_path}/a\0b.ply", f"{tmp_path}/{'a' * 5000}.ply"):
+        with pytest.raises(jd.InputError) as error:
+            door(name)
+        assert "\0" not in str(error.value)
+        assert len(str(error.value)) <= 1000
+
+
+def test_nothing_of_a_file_reaches_the_terminal_unescaped(tmp_path):
+    evil = "\x1b]0;title\x07\x9b31m\u202e"
+    files = {
+        "m.obj": f"v 0 0 0\n{evil} 1\n",
+        "m.off": f"OFF\n1 1 0\n{evil}\n3 0 0 0\n",
+        "m.ply": f"ply\nformat {evil} 1.0\nelement vertex 1\nproperty int x\nproperty int y\n"
+        "property int z\nend_header\n",
+        "n.ply": f"ply\nformat ascii 1.0\nelement vertex 1\nelement {evil}{'a' * 9999} 5\n"
+        "property int x\nend_header\n",
+        "m.stl": f"solid\nvertex {evil}\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        with pytest.raises(jd.InputError) as error:
+            jd.load_mesh(tmp_path / name)
+        assert str(error.value).isprintable()
+        assert len(str(error.value)) <= 1000
+
+
+def test_stl_says_what_single_precision_loses(tmp_path):
+    """At 5e5, float32 steps by 1/32."""
+    path = tmp_path / "m.stl"
+    small = jd.shapes.square()
+    far = np.array([5e5, 5e5, 0.0]) + 0.3
+    for size, outcome in {0.01: "error", 1.0: "warning", 1e4: "nothing"}.items():
+        mesh = jd.Mesh(small.vertices * size + far, small.faces)
+        if outcome == "error":
+            rounded = mesh.vertices.astype(np.float32)[mesh.faces].tolist()
+            lost = sum(len(set(map(tuple, corners))) < 3 for corners in rounded)
+            message = rf"not written: STL keeps single .* up to 0\.\d+ and {lost} faces collapse"
+            with pytest.raises(jd.InputError, match=message):
+                jd.save_mesh(path, mesh)
+            assert not path.exists()
+            continue
+        if outcome == "warning":
+            with pytest.warns(UserWarning, match=r"move by up to 0\.\d+, and the shortest edge is"):
+                jd.save_mesh(path, mesh)
+        else:
+            jd.save_mesh(path, mesh)
+        assert jd.load_mesh(path).n_faces == 8
+    with pytest.raises(jd.InputError, match="not written: STL keeps single precision"):
+        jd.save_mesh(path, small, vertices=small.vertices * 1e39)

@@ -18,7 +18,7 @@ def test_bad_arrays_are_named():
         r"face 1 \[0, 1, 4\] names a vertex out of range": (v, replaced(f, (1, 2), 4)),
         r"face 3 \[-1, 3, 2\]": (v, replaced(f, (3, 0), -1)),
         r"face 2 \[1, 1, 3\] repeats a vertex: drop": (v, replaced(f, (2, 1), 1)),
-        r"face 0 \[0, 2, 1\] has no area: drop": (replaced(v, 2, [2, 0, 0]), f),
+        r"face 0 \[0, 2, 1\] has no area: drop": (v * [1, 0, 0], f),
         r"vertices have shape \(4, 2\)": (v[:, :2], f),
         r"vertices have shape \(0,\)": ([], f),
         r"faces have shape \(0,\)": (v, []),

@@ -1,0 +1,75 @@
+"""What the command line is given: poses, parts, a rigidity, a folder."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+import jaxdeform as jd
+from jaxdeform._checks import check_rigidity
+from jaxdeform._errors import shown
+from jaxdeform._estimation.parts import check_parts
+from jaxdeform._mesh.reading import read_json, read_text
+from jaxdeform._mesh.words import real
+
+
+def read_pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:
+    pose = jd.load_mesh(path)
+    # Polygons of a pose may have been cut along other diagonals.
+    polygons = pose.source and rest.source and pose.source.polygons.same(rest.source.polygons)
+    same = polygons or np.array_equal(pose.faces, rest.faces)
+    if pose.n_vertices != rest.n_vertices or not same:
+        raise jd.InputError(
+            f"{path}: is not a pose of {name}: {pose} and {rest} must have the same vertices and "
+            "faces, in the same order"
+        )
+    return pose.vertices
+
+
+def read_parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
+    if path.suffix.lower() == ".json":
+        values = read_json(path)
+    else:
+        values = [_number(word) for word in read_text(path).split()]
+    if not isinstance(values, list):
+        raise jd.InputError(f"{path}: give a list of one integer per vertex")
+    for vertex, value in enumerate(values):  # before an array, which would take true for 1
+        if type(value) is not int:
+            raise jd.InputError(
+                f"{path}: the part of vertex {vertex} is {shown(value)}: give an integer, "
+                "counted from 0 without gaps"
+            )
+    try:
+        return check_parts(values, mesh.n_vertices)
+    except jd.InputError as error:
+        raise jd.InputError(f"{path}: {error}") from error
+
+
+def _number(word: str) -> int | str:
+    """Return the integer, or the word if it is none."""
+    return int(word) if re.fullmatch(r"[+-]?[0-9]{1,18}", word) else word
+
+
+def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
+    try:
+        values = np.asarray(real(text.encode(errors="replace")))
+    except ValueError:
+        if not Path(text).exists():
+            raise jd.InputError(
+                f"--rigidity {text}: is neither a number nor a file: give a number or a PLY file"
+            ) from None
+        values = jd.load_rigidity(text)
+    try:
+        check_rigidity(values, mesh.n_vertices, values.dtype)
+    except jd.InputError as error:
+        raise jd.InputError(f"--rigidity {text}: {error}") from error
+    return values
+
+
+def make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise jd.InputError(
+            f"{folder}: cannot be made ({error.strerror}): choose another folder"
+        ) from error

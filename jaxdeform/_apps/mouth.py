@@ -1,0 +1,46 @@
+"""Standard output that may close or fill up while a command runs."""
+
+import io
+import os
+import sys
+
+
+class Mouth:
+    """Writes to standard output until that fails; from then on it is silent.
+
+    Who reads the output may leave early (``| head``), and a disk may be full. Neither may end the
+    work that the output only tells of.
+    """
+
+    failure: OSError | None = None
+    """What went wrong, if anything did."""
+
+    def write(self, text: str) -> int:
+        """Write the text; show as escapes what the terminal has no signs for."""
+        encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+        try:
+            sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        except OSError as error:
+            self.fail(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush standard output."""
+        try:
+            sys.stdout.flush()
+        except OSError as error:
+            self.fail(error)
+
+    def fail(self, error: OSError) -> None:
+        """Send the rest of standard output nowhere, also what Python flushes at its end."""
+        self.failure = error
+        try:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
+        except (OSError, io.UnsupportedOperation):
+            sys.stdout = io.StringIO()
+
+    def __getattr__(self, name: str):
+        """Return what standard output says, such as whether it is a terminal."""
+        return getattr(sys.stdout, name)

@@ -1,0 +1,45 @@
+"""What the command line writes: meshes and reports."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+import jaxdeform as jd
+from jaxdeform._errors import printable
+from jaxdeform._mesh.files import without_suffix
+
+
+def save_result(
+    out: Path, mesh: jd.Mesh, vertices: np.ndarray, rigidity: np.ndarray | None
+) -> None:
+    """Write the result, or beside it, as PLY, what its format cannot hold."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            jd.save_mesh(out, mesh, vertices=vertices, rigidity=rigidity)
+        except jd.InputError as error:
+            rescue = without_suffix(out).with_suffix(".rescued.ply")
+            try:
+                jd.save_mesh(rescue, mesh, vertices=vertices)
+            except jd.InputError:
+                raise error from None
+            raise jd.InputError(f"{error}; the result is in {rescue}") from error
+    for warning in caught:
+        print(f"jaxdeform: {printable(str(warning.message))}", file=sys.stderr)
+
+
+def as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
+    """Return the content of the report. JSON has no infinity, so null stands for it."""
+    finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
+    return {
+        "parts": [
+            {"rigidity": float(value), "interval": list(map(finite, pair)), "verdict": verdict}
+            for value, pair, verdict in zip(fit.rigidity, fit.interval, fit.verdict, strict=True)
+        ],
+        "misfit": finite(fit.misfit),
+        "history": list(map(finite, fit.history)),
+        "result": {"ok": fit.ok, "sentence": jd.Result[fit.result]},
+        "handles": handles.tolist(),
+    }

@@ -1,0 +1,97 @@
+"""OFF files (Geomview): read, write, and rewrite with other positions."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxdeform._errors import InputError
+from jaxdeform._mesh.parsed import Parsed
+from jaxdeform._mesh.polygons import Polygons, from_lists, vertex_normals
+from jaxdeform._mesh.words import (
+    content,
+    damaged,
+    excerpt,
+    joined,
+    polygon,
+    position,
+    stacked,
+    text_of,
+    whole,
+    with_words,
+)
+
+# COFF, NOFF and the like add normals or colours after the position. 4OFF changes the position.
+_FIRST_WORD = re.compile(rb"(ST)?C?(N?)OFF", re.IGNORECASE)
+
+
+def parse_off(path: Path, data: bytes) -> Parsed:
+    """Read positions and polygons."""
+    lines = data.splitlines()
+    filled = _filled(lines)
+    first = content(lines[filled[0]]) if filled else [b""]
+    if not _FIRST_WORD.fullmatch(first[0]):
+        raise InputError(f"{path}: does not start with OFF: check that it is an OFF file")
+    if first[1:2] and first[1].lower() == b"binary":
+        raise InputError(f"{path}: is a binary OFF file: export it as text")
+    begin = _body(lines, filled)
+    head = first[1:] or (content(lines[filled[1]]) if len(filled) > 1 else [])
+    try:
+        n, m = whole(head[0]), whole(head[1])
+    except (IndexError, ValueError):
+        raise damaged(path, "has no counts of vertices and faces") from None
+    body = filled[begin:]
+    if not 0 <= n + m <= len(body) or min(n, m) < 0:
+        raise damaged(path, f"announces {excerpt(head)} vertices and faces but holds fewer")
+    points = [position(path, k + 1, content(lines[k])) for k in body[:n]]
+    sizes: list[int] = []
+    corners: list[int] = []
+    for k in body[n : n + m]:
+        face = polygon(path, k + 1, content(lines[k]))
+        sizes.append(len(face))
+        corners += face
+    trailing = sum(len(lines[k]) for k in body[n + m :])
+    try:
+        return Parsed(stacked(points), from_lists(sizes, corners), trailing)
+    except OverflowError:
+        raise damaged(path, "names a vertex out of range") from None
+
+
+def to_off(points: np.ndarray, polygons: Polygons) -> bytes:
+    """Return the content of a file."""
+    lines = ["OFF", f"{len(points)} {len(polygons.sizes)} 0"]
+    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+    corners = list(map(str, polygons.corners.tolist()))
+    at = 0
+    for size in polygons.sizes.tolist():
+        lines.append(f"{size} " + " ".join(corners[at : at + size]))
+        at += size
+    return joined(lines)
+
+
+def rewrite_off(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
+    """Return a file with other positions, and normals computed anew; all else stays."""
+    lines = data.splitlines(keepends=True)
+    filled = _filled(lines)
+    first = _FIRST_WORD.fullmatch(content(lines[filled[0]])[0])
+    rows = points
+    if first and first[2]:
+        rows = np.concatenate([points, np.round(vertex_normals(points, polygons), 6)], axis=1)
+    begin = _body(lines, filled)
+    for k, row in zip(filled[begin : begin + len(points)], rows.tolist(), strict=True):
+        lines[k] = with_words(lines[k], 0, text_of(row))
+    return b"".join(lines)
+
+
+def _filled(lines: list[bytes]) -> list[int]:
+    """Return the lines that hold more than a comment."""
+    return [
+        k
+        for k, line in enumerate(lines)
+        if (line if b"#" not in line else line.split(b"#", 1)[0]).strip()
+    ]
+
+
+def _body(lines: list[bytes], filled: list[int]) -> int:
+    """Return how many lines come before the first vertex: the counts may have one of their own."""
+    return 1 if content(lines[filled[0]])[1:] else 2
