@@ -69,12 +69,11 @@ class Alternating:
                 gain = jnp.sum(at.gradient * move)
                 done |= has_converged(gain, at.energy, at.rounding, self.tolerance)
             # A^-1 K^T T as a correction of p, so that rounding errors do not accumulate.
-            return jnp.where(done, p, p - move), at.transforms, at.energy, at.rounding, done
+            return jnp.where(done, p, p - move), at.transforms, at.energy, done
 
         def advance(state: _State, index) -> _State:
-            p, transforms, value, rounding, done = step(state.p, index == self.steps)
-            steps = state.steps + jnp.where(done, 0, 1)
-            return _State(p, transforms, value, rounding, done, steps)
+            p, transforms, value, done = step(state.p, index == self.steps)
+            return _State(p, transforms, value, done, state.steps + jnp.where(done, 0, 1))
 
         def body(state: _State, index):
             if self.tolerance is None:
@@ -91,7 +90,7 @@ class Alternating:
         result = Result.steps_done
         if self.tolerance is not None:
             result = Result.where(end.steps < self.steps, Result.converged, Result.step_limit)
-        return Descent(end.p, end.transforms, history, end.rounding, end.steps, result)
+        return Descent(end.p, end.transforms, history, end.steps, result)
 
 
 class _State(NamedTuple):
@@ -100,7 +99,6 @@ class _State(NamedTuple):
     p: Float[Array, "3 vertices"]
     transforms: Float[Array, "3 3 vertices"]
     energy: Float[Array, ""]
-    rounding: Float[Array, ""]
     done: Bool[Array, ""]
     steps: Int[Array, ""]
 
@@ -109,4 +107,4 @@ class _State(NamedTuple):
         """Return the state before the first evaluation."""
         transforms = jnp.zeros((3, *start.shape), start.dtype)
         zero = jnp.zeros((), start.dtype)
-        return _State(start, transforms, zero, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))
+        return _State(start, transforms, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))

@@ -18,8 +18,6 @@ class Descent(NamedTuple):
     """T_k of every cell at these positions, in its principal axes."""
     energy: Float[Array, "history"]
     """At the start and after each step; anything behind the last one."""
-    rounding: Float[Array, ""]
-    """How far the last energy may be off by rounding alone."""
     steps: Int[Array, ""]
     result: Result
 

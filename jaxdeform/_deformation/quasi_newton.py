@@ -63,4 +63,4 @@ class QuasiNewton:
         settings = Settings(self.tolerance, self.max_steps, self.history_length)
         end = minimize(energy.evaluate_batch, system, inputs, start, settings)
         result = Result.where(end.converged, Result.converged, Result.step_limit)
-        return Descent(end.p, end.transforms, end.energy, end.rounding, end.steps, result)
+        return Descent(end.p, end.transforms, end.energy, end.steps, result)

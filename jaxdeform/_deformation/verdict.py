@@ -24,7 +24,9 @@ def verdict(system: System, inputs: Inputs, end: Descent) -> Result:
     low, high = both.min(axis=1, keepdims=True), both.max(axis=1, keepdims=True)
     margin = _FAR * jnp.sqrt(jnp.sum((high - low) ** 2))
     near = jnp.all((end.positions >= low - margin) & (end.positions <= high + margin))
-    proportionate = near & (energy >= -10.0 * end.rounding)
+    stretch = jnp.sum(end.transforms**2, axis=0)
+    size = jnp.sum(jnp.abs(system.principal_moments) * stretch)  # of the terms that make the energy
+    proportionate = near & (energy >= -jnp.sqrt(jnp.finfo(energy.dtype).eps) * size)
     valid = (
         jnp.all(jnp.isfinite(inputs.targets))
         & jnp.all((inputs.rigidity >= 0) & jnp.isfinite(inputs.rigidity))

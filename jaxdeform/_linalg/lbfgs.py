@@ -59,8 +59,6 @@ class Minimum(NamedTuple):
     transforms: Float[Array, "3 3 vertices"]
     energy: Float[Array, "history"]
     """At the start and after each step; undefined beyond the last step."""
-    rounding: Float[Array, ""]
-    """How far the last energy may be off by rounding alone."""
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
@@ -155,7 +153,6 @@ def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
         jnp.zeros_like(start),
         jnp.zeros((count, 3, *start.shape[1:]), start.dtype),
         jnp.zeros((count, settings.max_steps + 1), start.dtype),
-        jnp.zeros(count, start.dtype),
         jnp.zeros(count, jnp.int32),
         jnp.zeros(count, bool),
     )
@@ -177,8 +174,7 @@ def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
         done = _done(work, settings) & ~idle
         ended = work.stalled | _converged(work, settings)
         transforms = jnp.moveaxis(work.at.transforms, -1, 0)
-        steps, rounding = work.iteration - 1, work.at.rounding
-        found = Minimum(work.p, transforms, work.history, rounding, steps, ended)
+        found = Minimum(work.p, transforms, work.history, work.iteration - 1, ended)
         place = jnp.where(done, member, count)
         out = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), out, found)
         member = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, member)

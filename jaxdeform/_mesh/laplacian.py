@@ -40,7 +40,27 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
     vertices = vertices / np.abs(vertices).max()
     matrix = igl.cotmatrix(vertices, mesh.solid_faces).tocsr()
     i, j = mesh.edges.T
-    return np.asarray(matrix[i, j]).ravel()
+    weights = np.asarray(matrix[i, j]).ravel()
+    if not np.isfinite(weights).all():
+        # libigl takes areas from lengths, which sees none in a triangle of height 1e-8.
+        weights = _weights_by_products(mesh, vertices)
+    return weights
+
+
+def _weights_by_products(
+    mesh: Mesh, vertices: Float[np.ndarray, "vertices 3"]
+) -> Float[np.ndarray, "edges"]:
+    """Return the cotangent weights by dot and cross products, corner by corner."""
+    n, faces = mesh.n_vertices, mesh.solid_faces
+    keys = mesh.edges[:, 0] * n + mesh.edges[:, 1]
+    weights = np.zeros(len(keys))
+    for k in range(3):
+        corner, a, b = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        u, v = vertices[a] - vertices[corner], vertices[b] - vertices[corner]
+        cotangent = (u * v).sum(axis=1) / np.linalg.norm(np.cross(u, v), axis=1)
+        edge = np.searchsorted(keys, np.minimum(a, b) * n + np.maximum(a, b))
+        np.add.at(weights, edge, 0.5 * cotangent)
+    return weights
 
 
 def lifted_weights(weights: Float[np.ndarray, "edges"]) -> Float[np.ndarray, "edges"]:

@@ -41,9 +41,10 @@ class Mesh:
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
     - source: what :func:`load_mesh` remembers of a file with these faces, for :func:`save_mesh`.
 
-    **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (for derivatives
-    to the rest shape see ``deform(rest=)``); a vertex is not finite; a face index is out of range; a
-    face repeats a vertex, or none has an area (:func:`repair`); the source has other faces.
+    **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (see
+    ``deform(rest=)`` for derivatives to the rest shape); a vertex is not finite; a face index is
+    out of range; a face repeats a vertex, or none has an area (:func:`repair`); the source has
+    other faces.
 
     Example:
         >>> import jaxdeform as jd

@@ -214,3 +214,13 @@ def test_bad_input_gets_a_clear_error(bar, bar_problem, bar_targets, message):
 def test_shape_errors_also_come_while_tracing(bar_problem, bar_targets):
     with pytest.raises(jd.InputError, match="targets have shape"):
         jax.jit(lambda t: jd.deform(bar_problem, t, 1.0).vertices)(bar_targets[:-1])
+
+
+def test_a_flattened_cylinder_moves_along():
+    """Its triangles are 1e-8 high; by lengths they have no area, and their cotangents were NaN."""
+    cylinder = jd.shapes.cylinder()
+    mesh = jd.Mesh(cylinder.vertices * [1, 1, 1e-8], cylinder.faces)
+    handles = ends(mesh)
+    out = jd.deform(jd.precompute(mesh, handles), mesh.vertices[handles] + [0.1, 0, 0], 1.0)
+    assert out.result == jd.Result.converged
+    np.testing.assert_allclose(out.vertices, mesh.vertices + [0.1, 0, 0], atol=1e-6)

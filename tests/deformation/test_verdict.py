@@ -49,9 +49,8 @@ def test_an_end_out_of_proportion_is_no_result(sheet):
 
     def of(positions, energy):
         history = jnp.asarray([1.0, energy])
-        t = jnp.zeros((3, *system.rest.shape))
-        steps = jnp.asarray(1, jnp.int32)
-        end = Descent(positions, t, history, jnp.asarray(1e-12), steps, R.converged)
+        t = jnp.broadcast_to(jnp.eye(3)[..., None], (3, *system.rest.shape))
+        end = Descent(positions, t, history, jnp.asarray(1, jnp.int32), R.converged)
         return verdict(system, inputs, end)
 
     assert of(system.rest, 0.5) == R.converged
