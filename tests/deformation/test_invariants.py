@@ -51,9 +51,10 @@ def test_rigid_motion_of_the_handles_moves_everything_rigidly(bar, bar_problem, 
         2.0,
         normals=normals,
         start=bar.vertices if not normals else moved,
-        solver=jd.Alternating(5) if normals else jd.QuasiNewton(tolerance=1e-16),
+        solver=jd.Alternating(5) if normals else jd.QuasiNewton(tolerance=1e-14),
     )
-    assert relative(out.vertices, moved) < 1e-6
+    # Near 0 the energy tells positions apart only to the square root of its rounding.
+    assert relative(out.vertices, moved) < 3e-6
     np.testing.assert_allclose(out.transforms, np.broadcast_to(turn, (722, 3, 3)), atol=1e-5)
 
 

@@ -63,7 +63,9 @@ def test_another_material_reaches_its_own_equilibrium(sheet):
     assert np.abs(ends[jd.Newton()] - ends[Corotated()]).max() > 1e-3
 
 
-@pytest.mark.parametrize("local", [Corotated(), jd.AffineFit()])
+@pytest.mark.parametrize(
+    "local", [Corotated(), pytest.param(jd.AffineFit(), marks=pytest.mark.slow)]
+)
 def test_both_solvers_reach_the_minimum_of_another_energy(sheet, local):
     """QuasiNewton accepts steps by the energy of the law, not by that of Eq. 4.4."""
     problem, targets = sheet

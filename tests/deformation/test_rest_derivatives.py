@@ -27,8 +27,15 @@ def value(out, weight, of_transforms=1.0):
     return shape + of_transforms * t
 
 
-@pytest.mark.parametrize("soft", [np.inf, 2.0])
-@pytest.mark.parametrize("local", [jd.Newton(), jd.RotationFit(), jd.AffineFit()])
+LAWS = [jd.Newton(), jd.RotationFit(), jd.AffineFit()]
+CASES = [
+    pytest.param(local, soft, marks=[] if (local, soft) == (jd.Newton(), 2.0) else pytest.mark.slow)
+    for local in LAWS
+    for soft in (np.inf, 2.0)
+]
+
+
+@pytest.mark.parametrize(("local", "soft"), CASES)
 def test_derivatives_to_the_rest_shape(case, local, soft):
     mesh, handles, targets, rigidity, weight, direction = case
     # The affine fit of a flat cell (a corner with one face) jumps along the normal with the shape.

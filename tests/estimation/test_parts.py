@@ -13,7 +13,7 @@ from jaxdeform._apps import cli
 # ---------------------------------------------------------------- recovery
 
 
-@pytest.mark.parametrize("true", [0.05, 1.0, 30.0])
+@pytest.mark.parametrize("true", [pytest.param(0.05, marks=pytest.mark.slow), 1.0, 30.0])
 def test_one_rigidity_is_recovered_from_a_soft_start(bar_problem, pose_of, true):
     fit = jd.estimate_rigidity(bar_problem, pose_of(true), start=0.01)
     assert abs(fit.rigidity[0] / true - 1) < 1e-6
@@ -169,7 +169,7 @@ def test_command_refuses_what_does_not_fit(monkeypatch, tmp_path, capsys, bar):
         ([rest, rest, "-o", out, "--parts", tmp_path / "short.txt"], "parts have shape"),
         (
             [rest, rest, "-o", out, "--parts", tmp_path / "words.json"],
-            "words.json: parts cannot be read",
+            "words.json: the part of vertex 0 is 'soft'",
         ),
         ([rest, tmp_path / "none.ply", "-o", out], "none.ply"),
     ):

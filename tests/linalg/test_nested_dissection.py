@@ -249,6 +249,7 @@ def _is_jaxpr(x) -> bool:
     return hasattr(x, "eqns") or hasattr(x, "jaxpr")
 
 
+@pytest.mark.slow
 def test_all_products_are_exact_on_a_gpu(bar, accelerator):
     """A GPU would by default multiply float32 as TF32, with three digits."""
     handles = ends(bar)

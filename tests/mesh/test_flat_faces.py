@@ -42,6 +42,7 @@ def test_a_mesh_deforms_as_without_them(pair, normals):
     np.testing.assert_allclose(poses[1][9], pair[1].vertices[9], atol=EXACT)
 
 
+@pytest.mark.slow
 def test_derivatives_to_the_rest_shape_leave_them_out(pair):
     # Turned, so that rounding gives the flat faces an area.
     turn = Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix()
