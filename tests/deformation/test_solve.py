@@ -220,7 +220,7 @@ def test_a_flattened_cylinder_moves_along():
     """Its triangles are 1e-8 high; by lengths they have no area, and their cotangents were NaN."""
     cylinder = jd.shapes.cylinder()
     mesh = jd.Mesh(cylinder.vertices * [1, 1, 1e-8], cylinder.faces)
-    handles = ends(mesh)
-    out = jd.deform(jd.precompute(mesh, handles), mesh.vertices[handles] + [0.1, 0, 0], 1.0)
+    handles, shift = ends(mesh), np.array([0.1, 0, 0])
+    out = jd.deform(jd.precompute(mesh, handles), mesh.vertices[handles] + shift, 1.0)
     assert out.result == jd.Result.converged
-    np.testing.assert_allclose(out.vertices, mesh.vertices + [0.1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(out.vertices, mesh.vertices + shift, atol=1e-6)
