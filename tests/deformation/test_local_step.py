@@ -5,6 +5,7 @@ least curvature mu, so a gradient g leaves T within |g| / mu of the minimum, and
 the sum of theirs. A factor of 2 allows for mu, which is that at one of the two.
 """
 
+import warnings
 from functools import partial
 
 import jax
@@ -319,7 +320,9 @@ def real_cells():
         try:
             mesh = jd.load_mesh(REAL / file)
             one_each = np.unique(mesh.components[mesh.referenced], return_index=True)[1]
-            problem = jd.precompute(mesh, np.flatnonzero(mesh.referenced)[one_each])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of negative weights
+                problem = jd.precompute(mesh, np.flatnonzero(mesh.referenced)[one_each])
         except jd.InputError:
             continue  # not a manifold, for instance: refused before any cell is solved
         x = np.asarray(problem.system.rest)
@@ -341,7 +344,8 @@ def real_cells():
 @pytest.mark.parametrize("way", ["jit", "scan", "vmap"])
 @pytest.mark.parametrize("dtype", BOTH, ids=name)
 def test_every_cell_of_the_real_meshes(real_cells, dtype, way):
-    data = [x.astype(dtype) for x in real_cells]
+    # Scan and vmap run what jit runs: two chunks show it, and all of them take half an hour.
+    data = [x[: None if way == "jit" else 2].astype(dtype) for x in real_cells]
     solutions = {}
     for local in ALL:
         if way == "jit":
