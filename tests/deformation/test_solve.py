@@ -216,6 +216,7 @@ def test_shape_errors_also_come_while_tracing(bar_problem, bar_targets):
         jax.jit(lambda t: jd.deform(bar_problem, t, 1.0).vertices)(bar_targets[:-1])
 
 
+@pytest.mark.filterwarnings("ignore:negative weights")
 def test_a_flattened_cylinder_moves_along():
     """Its triangles are 1e-8 high; by lengths they have no area, and their cotangents were NaN."""
     cylinder = jd.shapes.cylinder()
