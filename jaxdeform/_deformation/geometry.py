@@ -18,7 +18,7 @@ from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._deformation.problem import Problem, System
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells
-from jaxdeform._mesh.laplacian import cotangent_weights
+from jaxdeform._mesh.laplacian import cotangent_weights, opposite_edges
 
 
 class Graph(eqx.Module):
@@ -73,17 +73,13 @@ def _graph_of(cells: Cells, dtype: np.dtype) -> Graph:
     mesh = cells.mesh
     count = np.diff(cells.membership.indptr)
     index = lambda x: jnp.asarray(np.ascontiguousarray(x), jnp.int32)  # noqa: E731
-    low, high = mesh.edges.T
-    faces = mesh.solid_faces  # only these have edges
-    i, j = faces[:, [1, 2, 0]].T, faces[:, [2, 0, 1]].T
-    keys = np.minimum(i, j) * mesh.n_vertices + np.maximum(i, j)
     return Graph(
         edges=index(mesh.edges.T),
         cell=index(np.repeat(np.arange(cells.n_vertices), count)),
         member=index(cells.membership.indices),
         overlap=jnp.asarray(cells.overlap, dtype),
-        faces=index(faces.T),
-        opposite=index(np.searchsorted(low * mesh.n_vertices + high, keys)),
+        faces=index(mesh.solid_faces.T),
+        opposite=index(opposite_edges(mesh)),
         follows=jnp.asarray(cells.weights == cotangent_weights(mesh)),
     )
 

@@ -281,7 +281,7 @@ def _solve(
     )
 
 
-@partial(jax.custom_jvp)
+@jax.custom_jvp
 def _without_derivative(system: System) -> System:
     """Return the system, which refuses to be differentiated in."""
     return system

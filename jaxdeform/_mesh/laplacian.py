@@ -51,16 +51,20 @@ def _weights_by_products(
     mesh: Mesh, vertices: Float[np.ndarray, "vertices 3"]
 ) -> Float[np.ndarray, "edges"]:
     """Return the cotangent weights by dot and cross products, corner by corner."""
-    n, faces = mesh.n_vertices, mesh.solid_faces
-    keys = mesh.edges[:, 0] * n + mesh.edges[:, 1]
-    weights = np.zeros(len(keys))
-    for k in range(3):
-        corner, a, b = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        u, v = vertices[a] - vertices[corner], vertices[b] - vertices[corner]
+    corner = [vertices[k] for k in mesh.solid_faces.T]
+    weights = np.zeros(len(mesh.edges))
+    for k, edge in enumerate(opposite_edges(mesh)):
+        u, v = (corner[(k + step) % 3] - corner[k] for step in (1, 2))
         cotangent = (u * v).sum(axis=1) / np.linalg.norm(np.cross(u, v), axis=1)
-        edge = np.searchsorted(keys, np.minimum(a, b) * n + np.maximum(a, b))
         np.add.at(weights, edge, 0.5 * cotangent)
     return weights
+
+
+def opposite_edges(mesh: Mesh) -> Int[np.ndarray, "3 faces"]:
+    """Return the row of ``mesh.edges`` opposite to each corner of each face that has an area."""
+    i, j = mesh.solid_faces[:, [1, 2, 0]].T, mesh.solid_faces[:, [2, 0, 1]].T
+    keys = mesh.edges[:, 0] * mesh.n_vertices + mesh.edges[:, 1]  # edges are in ascending order
+    return np.searchsorted(keys, np.minimum(i, j) * mesh.n_vertices + np.maximum(i, j))
 
 
 def lifted_weights(weights: Float[np.ndarray, "edges"]) -> Float[np.ndarray, "edges"]:
