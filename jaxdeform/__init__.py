@@ -33,10 +33,12 @@ from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_ma
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
 from jaxdeform._errors import InputError
+from jaxdeform._estimation.discrepancy import Discrepancy
 from jaxdeform._estimation.field import FieldEstimate, estimate_rigidity_field
 from jaxdeform._estimation.parts import Estimate, estimate_rigidity
 from jaxdeform._estimation.rigid_groups import RigidGroup, find_handle_groups, find_handles
 from jaxdeform._estimation.thesis import ThesisEstimate, estimate_rigidity_thesis
+from jaxdeform._estimation.verdict import Verdict
 from jaxdeform._handles.files import HandleFile, load_handles
 from jaxdeform._handles.rigid import rigid_targets
 from jaxdeform._handles.targets import bend, rotate, translate, twist
@@ -58,6 +60,7 @@ __all__ = [
     "AffineFit",
     "Alternating",
     "Cells",
+    "Discrepancy",
     "Estimate",
     "FieldEstimate",
     "GradientDescent",
@@ -80,6 +83,7 @@ __all__ = [
     "Submesh",
     "ThesisEstimate",
     "Unrolled",
+    "Verdict",
     "bend",
     "bounded_biharmonic_weights",
     "cotangent_weights",

@@ -37,6 +37,14 @@ class Result(eqx.Enumeration):
         "the mesh and its targets. Check the targets, and whether a rigidity near 0 resists enough."
     )
     fitted = "Converged: a further step would not lower the misfit visibly."
+    unexplained = (
+        "Converged, but the model does not explain these poses: the residual is smooth, not noise. "
+        "`discrepancy` and `explain()` say how large it is and where."
+    )
+    unsettled = (
+        "Not settled: the misfit jumps between equilibria of the poses, so there is no interval. "
+        "Try another start, poses that are less extreme, or a lower tolerance of the solver."
+    )
     settled = "Stopped: rigidity changed by less than the threshold."
     evaluation_limit = (
         "Stopped at the limit of evaluations: allow more (max_evaluations), or start nearer."

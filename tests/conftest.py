@@ -60,5 +60,14 @@ def pose_of(bar_problem: jd.Problem, bar_targets: np.ndarray):
 
 
 @pytest.fixture(scope="session")
+def equilibrium_of(bar_problem: jd.Problem, bar_targets: np.ndarray):
+    """Return equilibria of the bent bar by rigidity, from another solver than the default."""
+    to_the_end = jd.Alternating(steps=3000)
+    return lambda rigidity: np.asarray(
+        jd.deform(bar_problem, bar_targets, rigidity, solver=to_the_end).vertices
+    )
+
+
+@pytest.fixture(scope="session")
 def halves(bar: jd.Mesh) -> np.ndarray:
     return (bar.vertices[:, 1] > 75).astype(int)

@@ -107,7 +107,7 @@ def good_calls(folder: Path) -> dict:
         ),
         "estimate_rigidity": (
             jd.estimate_rigidity,
-            {**fit, "parts": np.zeros(N, int), "displacement_tolerance": 1e-2},
+            {**fit, "parts": np.zeros(N, int), "target_noise": 0.0, "determined_within": 10.0},
         ),
         "estimate_rigidity_field": (jd.estimate_rigidity_field, {**fit, "smoothness": 1e-4}),
         "estimate_rigidity_thesis": (
@@ -201,7 +201,7 @@ OF_KIND = {
     "translations vertices weights",
     "indices": "faces free group handles parts r sources",
     "count": "history_length max_evaluations max_steps steps width",
-    "tolerance": "displacement_tolerance smoothness step_size threshold tolerance",
+    "tolerance": "determined_within smoothness step_size target_noise threshold tolerance",
     "path": "path motion",
     "setting": "adjoint local solver",
     "flag": "normals similarity throw",

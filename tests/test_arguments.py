@@ -24,9 +24,19 @@ def calls(tmp_path_factory) -> dict:
 
 # Results and protocols: a user does not make them.
 NOT_CALLED = {
-    *("Adjoint", "Cells", "Estimate", "FieldEstimate", "HandleFile", "InputError", "Inspection"),
+    *(
+        "Adjoint",
+        "Cells",
+        "Discrepancy",
+        "Estimate",
+        "FieldEstimate",
+        "HandleFile",
+        "InputError",
+        "Inspection",
+    ),
     *("LocalStep", "Problem", "Result", "RigidGroup", "Skeleton", "Solution", "Solver"),
     "ThesisEstimate",
+    "Verdict",
 }
 NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
 # What the text may call an argument instead of its name.

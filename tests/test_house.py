@@ -151,7 +151,10 @@ def test_readme_python_runs(tmp_path, monkeypatch):
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
     # What the text says comes out. The pose is that of the solver's tolerance.
-    np.testing.assert_allclose(names["fit"].rigidity, [0.01, 30.0], rtol=0.1)
+    np.testing.assert_allclose(names["fit"].rigidity, [0.01, 30.0], rtol=0.02)
+    low, high = names["fit"].interval.T
+    assert (low < [0.01, 30.0]).all()
+    assert (high > [0.01, 30.0]).all()
     assert jd.load_rigidity(tmp_path / "bent.ply").shape == (722,)
 
 

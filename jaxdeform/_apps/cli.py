@@ -280,9 +280,8 @@ def estimate(
     jd.save_mesh(out, shape, rigidity=fit.field)
     text = json.dumps(as_json(fit, index), indent=1, allow_nan=False)
     write_atomically(report, f"{text}\n".encode())
-    console.print(_part_table(fit, label))
-    console.print(f"misfit {fit.misfit:.4g} after {len(fit.history)} evaluations, {_since(began)}")
-    console.print(jd.Result[fit.result])
+    console.print(fit.explain())
+    console.print(f"estimated in {_since(began)}")
     _say_wrote(out, report)
 
 
@@ -297,14 +296,6 @@ def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.
 def _show_evaluation(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
     values = ", ".join(f"{value:.3g}" for value in rigidity[:5])
     console.print(f"evaluation {evaluation}: misfit {misfit:.4g}, rigidity {values}")
-
-
-def _part_table(fit: jd.Estimate, label: np.ndarray) -> Table:
-    table = Table("part", "vertices", "rigidity", "95 % interval", "verdict")
-    for k, (value, (low, high)) in enumerate(zip(fit.rigidity, fit.interval, strict=True)):
-        size = str(int((label == k).sum()))
-        table.add_row(str(k), size, f"{value:.4g}", f"{low:.4g} to {high:.4g}", fit.verdict[k])
-    return table
 
 
 def _since(began: float) -> str:

@@ -35,10 +35,23 @@ def as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
     finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
     return {
         "parts": [
-            {"rigidity": float(value), "interval": list(map(finite, pair)), "verdict": verdict}
-            for value, pair, verdict in zip(fit.rigidity, fit.interval, fit.verdict, strict=True)
+            {
+                "rigidity": float(fit.rigidity[k]),
+                "material": float(fit.material[k]),
+                "interval": list(map(finite, fit.interval[k])),
+                "verdict": fit.verdict[k].name,
+                "displacement": list(map(finite, fit.displacement[k])),
+            }
+            for k in range(len(fit.rigidity))
         ],
         "misfit": finite(fit.misfit),
+        "relative_misfit": finite(fit.relative_misfit),
+        "solver_error": finite(fit.solver_error),
+        "discrepancy": {
+            name: finite(value) if isinstance(value, float) else value
+            for name, value in fit.discrepancy._asdict().items()
+        },
+        "outliers": np.argwhere(fit.outliers).tolist(),
         "history": list(map(finite, fit.history)),
         "result": {"ok": fit.ok, "sentence": jd.Result[fit.result]},
         "handles": handles.tolist(),

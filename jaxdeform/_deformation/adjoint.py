@@ -103,13 +103,14 @@ class Implicit:
         end = solver.minimize(energy, *jax.lax.stop_gradient((system, known, start)))
         end = jax.lax.stop_gradient(end)
         state = end.positions, end.transforms
-        p, anchor = self._with_implicit_derivative(energy, system, inputs, *state)
+        p, anchor = self.minimum(energy, system, inputs, *state)
         return end._replace(positions=p), anchor
 
-    def _with_implicit_derivative(self, energy: ReducedEnergy, system, inputs, p, transforms):
+    def minimum(self, energy: ReducedEnergy, system, inputs, p, transforms):
         """Return p, known to be near the minimiser for these inputs, with the derivatives of that.
 
-        And where they were taken: at p moved by a Newton step, if any derivative is asked for.
+        If any derivative is asked for, p is moved by a Newton step, and the derivatives are taken
+        there; they need that place as well.
 
         (lax.custom_root would do it too, but it traces the derivatives even where nobody asks for
         any: 0.7 s.)
@@ -136,7 +137,7 @@ class Implicit:
             move = self._solve_hessian(system, hessian, -right)
             move = jnp.where(system.free[None], move, tangents[1].targets)
             moves = move, Anchor(move, jnp.zeros_like(transforms))
-            return (known, Anchor(p, transforms)), moves
+            return (p, Anchor(p, transforms)), moves
 
         return minimiser(system, inputs, p, transforms)
 

@@ -150,7 +150,7 @@ def deform(
     relative = _from_center(problem, "targets", targets, len(problem.handles), "handle")
     if start is not None:
         start = _from_center(problem, "start", start, count, "vertex")
-    spread = _spread_targets(problem, relative)
+    spread = spread_targets(problem, relative)
     soft = _spread_weights(problem, handle_weights)
     # NumPy's arrays are JAX's once they are inside.
     inputs = Inputs(cast(Array, spread), cast(Array, rigidity), soft)
@@ -211,7 +211,7 @@ def _from_center(
     return given
 
 
-def _spread_targets(
+def spread_targets(
     problem: Problem,
     targets: Float[Array, "3 handles"] | Float[np.ndarray, "3 handles"],
 ) -> Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"]:

@@ -21,14 +21,12 @@ from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._errors import ArrayLike
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
-from jaxdeform._estimation.noise import NORMAL_95
+from jaxdeform._estimation.deformed import pose, states
 from jaxdeform._estimation.poses import (
     Poses,
     check_poses,
     check_start,
-    deformed,
     log_bounds,
-    residual_of,
     same_length,
 )
 from jaxdeform._estimation.search import Found, search
@@ -36,6 +34,8 @@ from jaxdeform._linalg.cholesky import Factor, factorise
 from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian, lifted_weights
 from jaxdeform._result import Result, succeeded
 
+# Half-width of the 95 % interval of the normal distribution, in standard deviations.
+_NORMAL_95 = 1.959964
 # Conjugate gradients of one Gauss-Newton step, which need not be exact.
 _CG_TOLERANCE, _CG_STEPS = 1e-2, 60
 # The prior is strong at first and weakens by this factor a stage.
@@ -137,7 +137,7 @@ def estimate_rigidity_field(
     best, result = _search_in_stages(evaluate, theta, bounds, prior, weights, left)
     misfit = poses.root_mean_square(np.asarray(best.run.residual))
     noise = max(misfit, same_length(problem))
-    deviation = NORMAL_95 * noise * np.asarray(_spread(best.evaluation, best.solve))
+    deviation = _NORMAL_95 * noise * np.asarray(_spread(best.evaluation, best.solve))
     theta = np.asarray(best.run.theta, np.float64)
     return FieldEstimate(
         field=np.exp(theta),
@@ -199,11 +199,19 @@ class _Linearised(NamedTuple):
     jacobian: lx.FunctionLinearOperator
 
 
-@eqx.filter_jit
 def _linearise(problem, poses: Poses, theta, solver, adjoint) -> _Linearised:
+    ends = states(problem, poses, np.exp(theta), solver, adjoint)
+    state = jax.tree.map(lambda *each: jnp.stack(each), *ends)
+    return _linearise_at(problem, poses, theta, state, solver, adjoint)
+
+
+@eqx.filter_jit
+def _linearise_at(problem, poses: Poses, theta, state, solver, adjoint) -> _Linearised:
     def run(theta):
-        vertices = deformed(problem, poses.targets, jnp.exp(theta), solver, adjoint)
-        return residual_of(poses, vertices), vertices
+        one = lambda each: pose(problem, each[0], jnp.exp(theta), each[1], solver, adjoint)  # noqa: E731
+        vertices = jax.lax.map(one, (poses.targets, state))
+        residual = jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
+        return residual, vertices
 
     residual, push, vertices = jax.linearize(run, theta, has_aux=True)
     jacobian = lx.FunctionLinearOperator(push, jax.eval_shape(lambda: theta))

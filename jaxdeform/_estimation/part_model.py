@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation
-from jaxdeform._estimation.noise import whiten
-from jaxdeform._estimation.poses import PoseDerivatives, Poses, check_start, deform_all, log_bounds
+from jaxdeform._estimation.deformed import PoseDerivatives, deform_all, states
+from jaxdeform._estimation.noise import HandleNoise
+from jaxdeform._estimation.poses import Poses, check_start, log_bounds
 
 
 class Fit(NamedTuple):
@@ -22,6 +23,9 @@ class Fit(NamedTuple):
     vertices: Float[np.ndarray, "poses vertices 3"]
     jacobian: Float[np.ndarray, "poses vertices 3 parts"]
     residual: Float[np.ndarray, "poses vertices 3"]
+    solver_error: Float[np.ndarray, "poses vertices 3"]
+    noise: HandleNoise
+    """What the weights W allow for."""
     triangle: Float[np.ndarray, "rows columns"]
     """R of the QR decomposition of W^(1/2) [J, r]: all that a search needs of the equations."""
 
@@ -34,6 +38,14 @@ class Fit(NamedTuple):
     def cost(self) -> float:
         """r^T W r."""
         return float(self.triangle[:, -1] @ self.triangle[:, -1])
+
+    @property
+    def white(self) -> tuple[np.ndarray, np.ndarray]:
+        """W^(1/2) J and W^(1/2) r, by pose and vertex."""
+        shape = self.residual.shape
+        jacobian = self.noise.whiten(self.jacobian.reshape(shape[0], -1, len(self.theta)))
+        residual = self.noise.whiten(self.residual.reshape(shape[0], -1, 1))
+        return jacobian.reshape(*shape, -1), residual.reshape(shape)
 
     @property
     def evaluation(self) -> Evaluation:
@@ -77,15 +89,22 @@ class PartModel:
         """Return the rigidity of each vertex."""
         return np.exp(theta)[self.label]
 
-    def fit(self, theta: np.ndarray, modes: np.ndarray | None) -> Fit:
-        """Deform into all poses; ``modes`` are those of the handles' noise, if it counts."""
+    def fit(self, theta: np.ndarray, noise: HandleNoise) -> Fit:
+        """Deform into all poses, and weight the residual for the noise of the handles."""
         found = deform_all(self.problem, self.poses, self.label, theta, self.solver, self.adjoint)
-        return self.weighted(theta, found, modes)
+        return self.weighted(theta, found, noise)
 
-    def weighted(self, theta, derivatives: PoseDerivatives | Fit, modes) -> Fit:
-        """Return the linear model with the weights of these modes."""
-        jacobian, residual = np.asarray(derivatives.jacobian), np.asarray(derivatives.residual)
+    def weighted(self, theta, derivatives: PoseDerivatives | Fit, noise: HandleNoise) -> Fit:
+        """Return the linear model, weighted for this noise."""
+        jacobian, residual = derivatives.jacobian, derivatives.residual
         columns = np.concatenate([jacobian, residual[..., None]], axis=-1, dtype=np.float64)
-        columns = whiten(columns.reshape(len(residual), -1, len(theta) + 1), modes)
-        triangle = np.asarray(np.linalg.qr(columns.reshape(-1, len(theta) + 1), mode="r"))
-        return Fit(theta, np.asarray(derivatives.vertices), jacobian, residual, triangle)
+        white = noise.whiten(columns.reshape(len(residual), -1, len(theta) + 1))
+        triangle = np.asarray(np.linalg.qr(white.reshape(-1, len(theta) + 1), mode="r"))
+        vertices, error = derivatives.vertices, derivatives.solver_error
+        return Fit(theta, vertices, jacobian, residual, error, noise, triangle)
+
+    def positions(self, theta: np.ndarray) -> Float[np.ndarray, "poses vertices 3"]:
+        """Deform into all poses, without derivatives."""
+        field = np.exp(theta)[self.label].astype(self.problem.dtype)
+        ends = states(self.problem, self.poses, field, self.solver, self.adjoint)
+        return np.stack([np.asarray(end.vertices) for end in ends])

@@ -6,54 +6,111 @@ positive and makes 'ten times stiffer' the same step everywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxdeform._checks import check_count, check_function, check_labels, check_tolerance
-from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.bounded_gauss_newton import box_solver
-from jaxdeform._estimation.intervals import log_intervals, look_the_same, verdict
-from jaxdeform._estimation.noise import handle_modes
+from jaxdeform._estimation.discrepancy import LEVEL, Discrepancy, describe, f_test
+from jaxdeform._estimation.intervals import extremes, has_settled, linear_spread, log_intervals
+from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
+from jaxdeform._estimation.outliers import find_outliers
 from jaxdeform._estimation.part_model import Fit, PartModel
-from jaxdeform._estimation.poses import check_poses
+from jaxdeform._estimation.poses import check_poses, same_length, without
 from jaxdeform._estimation.search import search
+from jaxdeform._estimation.smooth_modes import smooth_modes
+from jaxdeform._estimation.verdict import Verdict, in_words
 from jaxdeform._result import Result, succeeded
+
+# Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
+# diagonal, which is ten times what solvers leave at their default tolerance.
+_OUTLIER_ROUNDS, _MISPLACED = 3, 1e-4
+# A vertex that moves less than this fraction of the diagonal does not move visibly.
+_VISIBLE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Rigidity as observed poses tell it, with what they do not tell."""
+    """Rigidity as observed poses tell it, with what they do not tell.
+
+    - rigidity: (parts,) best value of each part; its unit is length squared.
+    - material: (parts,) the same as a scale-free constant (:func:`rigidity_from_material`).
+    - interval: (parts, 2) 95 % interval of the rigidity of each part. It starts at 0 where the part
+      may be arbitrarily soft, and ends at infinity where it may be arbitrarily stiff.
+    - verdict: a :class:`Verdict` of each part, which follows from its interval.
+    - displacement: (parts, 2) how far a compared vertex moves at most (a length) if the part
+      becomes perfectly soft, or perfectly stiff. Where that is too little to see, the value hardly
+      matters, however well it is known.
+    - discrepancy: what the model leaves unexplained, a :class:`Discrepancy`.
+    - field: (vertices,) the rigidity of each vertex, as :func:`deform` takes it.
+    - vertices: (poses, vertices, 3) the fitted poses.
+    - misfit: root mean square of the differences between fitted and observed coordinates (a
+      length); relative_misfit: the same as a fraction of the bounding box diagonal.
+    - solver_error: root mean square distance of the solver's end from the minimum (a length). The
+      intervals allow for as much in the observed poses; a smaller misfit says nothing.
+    - outliers: (poses, vertices) True where a vertex was left out, because it was seen far from
+      where its neighbors say.
+    - history: (evaluations,) misfit of each evaluation, accepted or not.
+    - result: how the search ended, a member of :class:`Result`.
+    """
 
     rigidity: Float[np.ndarray, "parts"]
-    """Best value of each part; only a bound is known where the interval reaches 0 or infinity."""
+    material: Float[np.ndarray, "parts"]
     interval: Float[np.ndarray, "parts 2"]
-    """95 % interval of each part. It starts at 0 where the part may be arbitrarily soft, and ends
-    at infinity where it may be arbitrarily stiff."""
-    verdict: tuple[str, ...]
-    """Per part: 'determined', 'at least X' (stiffer makes no visible difference), 'at most X'
-    (softer makes none) or 'not determined by these poses'."""
+    verdict: tuple[Verdict, ...]
+    displacement: Float[np.ndarray, "parts 2"]
+    discrepancy: Discrepancy
     field: Float[np.ndarray, "vertices"]
-    """Rigidity per vertex, as deform takes it."""
     vertices: Float[np.ndarray, "poses vertices 3"]
-    """The fitted poses."""
     misfit: float
-    """Root mean square of the differences between fitted and observed coordinates (a length)."""
+    relative_misfit: float
+    solver_error: float
+    outliers: Bool[np.ndarray, "poses vertices"]
     history: Float[np.ndarray, "evaluations"]
-    """Misfit of each evaluation, accepted or not."""
     result: Result
-    """How the search ended: a member of :class:`Result`."""
 
     @property
     def ok(self) -> bool:
-        """True if the search converged."""
+        """True if the search converged and the model explains the poses."""
         return bool(succeeded(self.result))
+
+    def explain(self) -> str:
+        """Return everything in words, a line for each part and each fact."""
+        lines = [self._explain_part(k) for k in range(len(self.rigidity))]
+        lines.append(
+            f"misfit {self.misfit:.3g}, {100 * self.relative_misfit:.2g} % of the diagonal "
+            f"({len(self.history)} evaluations)"
+        )
+        if self.misfit <= self.solver_error:
+            lines.append(
+                f"the misfit is below the error of the solver ({self.solver_error:.2g}): the poses "
+                "are explained as well as its tolerance allows"
+            )
+        if self.outliers.any():
+            at = np.argwhere(self.outliers)
+            shown = ", ".join(f"{vertex} (pose {pose})" for pose, vertex in at[:3])
+            lines.append(f"left out as seen in a wrong place: vertices {shown} ({len(at)} in all)")
+        if self.discrepancy.found:
+            lines.append(self.discrepancy.explain())
+        return "\n".join([*lines, Result[self.result]])
+
+    def _explain_part(self, k: int) -> str:
+        text = f"part {k}: {in_words(self.verdict[k], self.rigidity[k], self.interval[k])}"
+        if self.verdict[k] is Verdict.determined:
+            text += f", material {self.material[k]:.3g}"
+        diagonal = self.misfit / self.relative_misfit if self.relative_misfit else np.inf
+        hidden = self.displacement[k] < _VISIBLE * diagonal
+        kinds = [kind for kind, unseen in zip(("softer", "stiffer"), hidden, strict=True) if unseen]
+        if kinds:
+            text += f"; {' or '.join(kinds)} makes no visible difference"
+        return text
 
 
 def estimate_rigidity(
@@ -62,11 +119,12 @@ def estimate_rigidity(
     *,
     parts: ArrayLike | None = None,
     targets: ArrayLike | None = None,
+    target_noise: float | None = None,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
-    solver: Solver = Alternating(steps=100),  # noqa: B008 (frozen)
+    solver: Solver = QuasiNewton(),  # noqa: B008 (frozen)
     adjoint: Adjoint | None = None,
-    displacement_tolerance: float = 1e-2,
+    determined_within: float = 10.0,
     max_evaluations: int = 50,
     progress: Callable[[int, float, np.ndarray], None] | None = None,
 ) -> Estimate:
@@ -76,17 +134,14 @@ def estimate_rigidity(
     Gauss-Newton on log rigidity within bounds and a trust region. (Algorithm 1 of the thesis, which
     takes the largest of the estimates of single poses, is :func:`estimate_rigidity_thesis`.)
 
-    The intervals assume that observed positions are the model plus independent noise of equal size
-    in all coordinates. If targets are taken from the observed poses, the handles carry that noise
-    too and pass it on, often enlarged. The covariance of the residual is then I + D D^T, where D is
-    d vertices / d targets. Few of its modes are far from the identity. They are found by random
-    probing, and a second search weights the residual by the inverse. A part whose interval is wide
-    is followed to both ends, with the other parts fitted anew. Where the misfit cannot be told from
-    the best one all the way, the interval ends at 0 or infinity.
+    Poses are taken for equilibria, as :func:`deform` makes them, whatever made them and in whatever
+    frame. Where several exist, it is the one next to the observed pose.
 
-    The verdict asks for more, because many vertices together reveal differences that nobody sees.
-    If making a part perfectly stiff moves no vertex by more than ``displacement_tolerance``, it is
-    'at least' the lower end of the interval; likewise 'at most' for perfectly soft.
+    The intervals hold where the model is a little wrong: the variance of the residual is measured
+    from its smoothest pattern to its roughest (a sandwich estimate), and the solver's own error is
+    added. An F test says whether the model explains the poses at all; if not, ``result`` says so,
+    and ``discrepancy`` how far off it is. If targets are taken from the observed poses, the handles
+    carry their noise too and pass it on, often enlarged; the residual is weighted for that.
 
     **Arguments**
 
@@ -95,86 +150,161 @@ def estimate_rigidity(
     - parts: (n,) the part of each vertex, 0 to p - 1; one part by default.
     - targets: (h, 3) or (poses, h, 3) where the handles were put; by default their observed
       positions.
+    - target_noise: noise of the targets, as a multiple of that of the observed vertices. By
+      default 0 for targets that were given, and 1 for observed ones. Measured targets given as
+      exact make the intervals far too narrow: say 1 then.
     - mask: (n,) or (poses, n), False where a vertex was not seen; its position is not read.
     - start: first guess, a number or (parts,); a medium material by default.
-    - solver, adjoint: as in :func:`deform`. ``Alternating(steps=100)`` with ``Unrolled()`` repeats
-      the thesis's deformations; ``QuasiNewton()`` runs them to convergence.
-    - displacement_tolerance: the largest displacement of a vertex that does not count as a
-      difference between poses (for the verdict), as a fraction of the bounding box diagonal of the
-      rest shape.
-    - max_evaluations: limit of the search; intervals and verdicts need more evaluations.
+    - solver, adjoint: as in :func:`deform`. Poses that were made by 100 steps of the thesis's
+      iteration are no equilibria: fit those with ``Alternating(steps=100)``.
+    - determined_within: a side of an interval is open if its end is more than this factor from the
+      best value (for the verdict).
+    - max_evaluations: limit of the search; intervals need more evaluations.
     - progress: called after each evaluation with its number, its misfit and the rigidities.
 
-    **Returns** an :class:`Estimate`.
+    **Returns** an :class:`Estimate`; its ``explain()`` says it in words.
 
-    **Raises** InputError: shapes that do not fit; positions that are seen and not finite; a handle
-    that was not seen, without targets; parts with gaps; nothing to observe, because every vertex is
-    a handle or masked; settings out of range.
+    **Raises** InputError: shapes that do not fit; positions that are seen and not finite; a pose in
+    another unit, mirrored, or in another frame than its targets; a handle that was not seen,
+    without targets; parts with gaps; nothing to observe, because every vertex is a handle or
+    masked; settings out of range.
 
     Example:
         >>> import jaxdeform as jd
         >>> mesh = jd.shapes.square()
         >>> problem = jd.precompute(mesh, [0, 1, 2, 6, 7, 8])
         >>> targets = jd.twist(mesh.vertices[problem.handles], 60.0, along="y")
-        >>> pose = jd.deform(problem, targets, 0.5, solver=jd.Alternating(steps=100)).vertices
-        >>> fit = jd.estimate_rigidity(problem, pose)
+        >>> pose = jd.deform(problem, targets, 0.5).vertices
+        >>> fit = jd.estimate_rigidity(problem, pose, targets=targets)
         >>> fit.verdict
-        ('determined',)
+        (<Verdict.determined: 'determined'>,)
     """
+    check_tolerance("determined_within", determined_within, positive=True)
+    check_count("max_evaluations", max_evaluations)
+    check_function("progress", progress, "evaluation, misfit, rigidity")
+    adjoint = choose_adjoint(solver, adjoint)
+    noise = float(targets is None) if target_noise is None else target_noise
+    check_tolerance("target_noise", noise)
     poses = check_poses(problem, observed, targets, mask)
     n = problem.n_vertices
     label = check_parts(np.zeros(n, int) if parts is None else parts, n)
-    adjoint = choose_adjoint(solver, adjoint)
-    check_tolerance("displacement_tolerance", displacement_tolerance)
-    check_count("max_evaluations", max_evaluations)
-    check_function("progress", progress, "evaluation, misfit, rigidity")
     model = PartModel.build(problem, poses, label, solver, adjoint)
-    found = _search_parts(model, model.start(start), targets is None, max_evaluations, progress)
-    best = found.best
-    interval = np.exp(log_intervals(model, best, found.modes))
-    same = look_the_same(model, best, displacement_tolerance * problem.mesh.diagonal)
-    return Estimate(
-        rigidity=np.exp(best.theta),
-        interval=interval,
-        verdict=tuple(map(verdict, interval, same)),
-        field=model.field(best.theta),
-        vertices=best.vertices,
-        misfit=poses.root_mean_square(best.residual),
-        history=np.array(found.history),
-        result=found.result,
-    )
+    found = _Search(model, noise, max_evaluations, progress).run(model.start(start))
+    return _judge(found, poses.counted, max(determined_within, 1.0))
 
 
-class _FoundParts(NamedTuple):
+class _Found(NamedTuple):
+    model: PartModel
+    """With the vertices that were kept."""
     best: Fit
-    modes: np.ndarray | None
-    """Modes of the handles' noise that weight the residual."""
+    modes: Float[np.ndarray, "poses vertices modes"]
+    p_value: float
+    """That the residual is noise."""
     result: Result
     history: list[float]
 
 
-def _search_parts(model: PartModel, theta, noisy_handles: bool, limit: int, progress):
-    """Search with equal weights, then with those of noisy handles, which depend on the rigidity."""
-    history: list[float] = []
+class _Search:
+    """The search in its stages: least squares, outliers, noisy handles, a model that is wrong."""
 
-    def counted(theta: np.ndarray, modes: np.ndarray | None) -> Fit:
-        fit = model.fit(theta, modes)
-        history.append(model.poses.root_mean_square(fit.residual))
-        if progress is not None:
-            progress(len(history), history[-1], np.exp(theta))
+    def __init__(self, model: PartModel, target_noise: float, limit: int, progress) -> None:
+        self.model, self.target_noise, self.limit = model, target_noise, limit
+        self.progress = progress
+        self.history: list[float] = []
+
+    def run(self, theta: np.ndarray) -> _Found:
+        """Search from a first guess."""
+        exact = HandleNoise.none(self.model.poses)
+        best, result = self._descend(self._evaluate(theta, exact))
+        best, result = self._without_outliers(best, result)
+        model, poses = self.model, self.model.poses
+        if self.target_noise and succeeded(result):
+            noise = find_handle_noise(
+                model.problem,
+                poses,
+                model.field(best.theta),
+                model.solver,
+                model.adjoint,
+                self.target_noise,
+            )
+            best, result = self._descend(model.weighted(best.theta, best, noise))
+        mesh = model.problem.mesh
+        modes = smooth_modes(mesh.vertices, poses.counted, mesh.diagonal)
+        jacobian, residual = best.white
+        p_value = f_test(jacobian, residual, modes, poses.count)
+        wrong = p_value < LEVEL and self.target_noise
+        if wrong and succeeded(result):
+            # Then the handles err as smoothly as the rest, and the weights do not hold.
+            noise = best.noise.unbounded
+            best, result = self._descend(model.weighted(best.theta, best, noise))
+        return _Found(model, best, modes, p_value, result, self.history)
+
+    def _evaluate(self, theta: np.ndarray, noise: HandleNoise) -> Fit:
+        fit = self.model.fit(theta, noise)
+        self.history.append(self.model.poses.root_mean_square(fit.residual))
+        if self.progress is not None:
+            self.progress(len(self.history), self.history[-1], np.exp(theta))
         return fit
 
-    solver, modes = box_solver(*model.bounds), None
-    first = counted(theta, modes)
-    best, result = search(partial(counted, modes=modes), first, solver, limit - len(history))
-    if noisy_handles and succeeded(result):
-        field = model.field(best.theta)
-        modes = np.asarray(
-            handle_modes(model.problem, model.poses, field, model.solver, model.adjoint)
-        )
-        first = model.weighted(best.theta, best, modes)
-        best, result = search(partial(counted, modes=modes), first, solver, limit - len(history))
-    return _FoundParts(best, modes, result, history)
+    def _descend(self, first: Fit):
+        """Search on from an evaluation, under its weights."""
+        evaluate = lambda theta: self._evaluate(theta, first.noise)  # noqa: E731
+        left = self.limit - len(self.history)
+        return search(evaluate, first, box_solver(*self.model.bounds), left)
+
+    def _without_outliers(self, best: Fit, result: Result):
+        floor = _MISPLACED * self.model.problem.mesh.diagonal
+        for _ in range(_OUTLIER_ROUNDS):
+            model = self.model
+            edges = model.problem.mesh.edges
+            far = find_outliers(edges, best.residual, model.poses.counted, floor)
+            if not far.any() or not succeeded(result) or len(self.history) >= self.limit:
+                break
+            self.model = replace(model, poses=without(model.problem, model.poses, far))
+            best, result = self._descend(self._evaluate(best.theta, best.noise))
+        return best, result
+
+
+def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
+    """Say how far the fit can be trusted."""
+    model, best, result = found.model, found.best, found.result
+    problem, poses = model.problem, model.poses
+    diagonal = problem.mesh.diagonal
+    linear = linear_spread(model, best, found.modes)
+    ends = np.full((len(best.theta), 2), [-np.inf, np.inf])
+    if succeeded(result):
+        if has_settled(model, best, linear):
+            ends = log_intervals(model, best, linear)
+        else:
+            result = Result.unsettled
+    reach = extremes(model, best)
+    misfit, solver_error = map(poses.root_mean_square, (best.residual, best.solver_error))
+    explained = misfit <= max(2.0 * solver_error, 10.0 * same_length(problem))
+    p_value = 1.0 if explained else found.p_value
+    discrepancy = describe(
+        best.residual, found.modes, poses.count, p_value, diagonal, reach.full_range
+    )
+    if discrepancy.found and succeeded(result):
+        result = Result.unexplained
+    rigidity, interval = np.exp(best.theta), np.exp(ends)
+    return Estimate(
+        rigidity=rigidity,
+        material=rigidity / model.size,
+        interval=interval,
+        verdict=tuple(
+            Verdict.of(value, pair, factor) for value, pair in zip(rigidity, interval, strict=True)
+        ),
+        displacement=reach.displacement,
+        discrepancy=discrepancy,
+        field=model.field(best.theta),
+        vertices=best.vertices,
+        misfit=misfit,
+        relative_misfit=misfit / diagonal,
+        solver_error=solver_error,
+        outliers=counted & ~poses.counted,
+        history=np.array(found.history),
+        result=result,
+    )
 
 
 def check_parts(parts: ArrayLike, n: int) -> Int[np.ndarray, "vertices"]:

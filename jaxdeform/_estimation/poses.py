@@ -1,18 +1,16 @@
 """Observed poses: checks, and what separates deformed poses from them."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxdeform._arrays import read_host_array, read_numbers
+from jaxdeform._baselines.laplacian_editing import laplacian_editing
 from jaxdeform._checks import check_rigidity, read_positions
 from jaxdeform._deformation.problem import Problem, check_problem
-from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import InputError
+from jaxdeform._estimation.resemblance import check_resemblance
 
 # Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.
@@ -29,6 +27,8 @@ class Poses(NamedTuple):
     observed: Float[np.ndarray, "poses vertices 3"]
     counted: Bool[np.ndarray, "poses vertices"]
     """Vertices that are free and were seen; the others' positions are 0 in ``observed``."""
+    start: Float[np.ndarray, "poses vertices 3"]
+    """Where deformations to a minimum start: as observed, so that it is the observed minimum."""
 
     @property
     def count(self) -> int:
@@ -40,48 +40,14 @@ class Poses(NamedTuple):
         return float(np.sqrt(np.sum(residual**2) / max(self.count, 1)))
 
 
-class PoseDerivatives(NamedTuple):
-    """Deformed poses and their derivatives with respect to log rigidity."""
-
-    vertices: Float[Array, "poses vertices 3"]
-    jacobian: Float[Array, "poses vertices 3 parts"]
-    """0 at vertices that do not count."""
-    residual: Float[Array, "poses vertices 3"]
-    """0 at vertices that do not count."""
-
-
 def same_length(problem: Problem) -> float:
     """Return the length below which positions are the same."""
-    return _EQUAL * problem.mesh.diagonal
+    return max(_EQUAL, 2.0 * float(np.finfo(problem.dtype).eps)) * problem.mesh.diagonal
 
 
 def log_bounds(size: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "2 unknowns"]:
     """Return the range of log rigidity, for materials whose constant 1 has these rigidities."""
     return np.log([_SOFTEST * size, _STIFFEST * size])
-
-
-def deformed(problem: Problem, targets, field, solver, adjoint) -> Float[Array, "poses vertices 3"]:
-    """Deform into each pose, one after the other: so each ends its own loops early."""
-    pose = lambda t: deform(problem, t, field, solver=solver, adjoint=adjoint).vertices  # noqa: E731
-    return jax.lax.map(pose, targets)
-
-
-@partial(jax.jit, static_argnames=("solver", "adjoint"))
-def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDerivatives:
-    """Deform into all poses, with derivatives in forward mode, all parts at once."""
-
-    def run(theta):
-        return deformed(problem, poses.targets, jnp.exp(theta)[label], solver, adjoint)
-
-    push = lambda direction: jax.jvp(run, (theta,), (direction,))  # noqa: E731
-    vertices, jacobian = jax.vmap(push, out_axes=(None, -1))(jnp.eye(len(theta), dtype=theta.dtype))
-    jacobian = jnp.where(poses.counted[..., None, None], jacobian, 0.0)
-    return PoseDerivatives(vertices, jacobian, residual_of(poses, vertices))
-
-
-def residual_of(poses: Poses, vertices) -> Float[Array, "poses vertices 3"]:
-    """Return deformed minus observed positions, 0 at vertices that do not count."""
-    return jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
 
 
 # ---------------------------------------------------------------- checks
@@ -108,7 +74,17 @@ def check_poses(problem: Any, observed: Any, targets: Any, mask: Any) -> Poses:
             "nothing is free to observe: every vertex is fixed by a handle or was not seen, so the "
             f"poses do not depend on the rigidity; {move}"
         )
-    return Poses(goal, np.where(counted[..., None], given, 0.0).astype(problem.dtype), counted)
+    check_resemblance(problem, given, seen, goal if targets is not None else None)
+    known = np.where(counted[..., None], given, 0.0).astype(problem.dtype)
+    return Poses(goal, known, counted, _starts(problem, known, counted, goal))
+
+
+def without(problem: Problem, poses: Poses, dropped: Bool[np.ndarray, "poses vertices"]) -> Poses:
+    """Return the poses as if these vertices had not been seen."""
+    counted = poses.counted & ~dropped
+    observed = np.where(counted[..., None], poses.observed, 0.0).astype(problem.dtype)
+    start = _starts(problem, observed, counted, poses.targets)
+    return Poses(poses.targets, observed, counted, start)
 
 
 def read_poses(
@@ -151,6 +127,19 @@ def _check_targets(problem, targets, given, seen) -> Float[np.ndarray, "poses ha
     goal = goal[None] if goal.ndim == 2 else goal
     shape = (len(given), len(handles), 3)
     return np.asarray(read_positions("targets", goal, shape, dtype, unit="pose"))
+
+
+def _starts(problem, observed, counted, goal) -> Float[np.ndarray, "poses vertices 3"]:
+    """Return the poses as observed; what was not seen follows by Laplacian editing."""
+    starts = np.array(observed)
+    starts[:, problem.handles] = goal
+    for pose, known in enumerate(counted):
+        known = known.copy()
+        known[problem.handles] = True
+        if not known.all():
+            at = np.flatnonzero(known)
+            starts[pose] = laplacian_editing(problem.mesh, at, starts[pose, at])
+    return starts.astype(problem.dtype)
 
 
 def check_start(start: Any, default: np.ndarray, unit: str) -> Float[np.ndarray, "unknowns"]:

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -12,7 +11,8 @@ from jaxdeform._deformation.descent import Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._estimation.poses import check_poses, residual_of
+from jaxdeform._estimation.deformed import residual_of
+from jaxdeform._estimation.poses import check_poses
 from jaxdeform._result import Result
 
 
@@ -72,7 +72,7 @@ def estimate_rigidity_thesis(
     for _ in range(max_evaluations):
         vertices = deform(problem, poses.targets[0], rigidity, solver=solver).vertices
         path.append(rigidity)
-        history.append(float(jnp.linalg.norm(residual_of(poses, vertices[None]))))
+        history.append(float(np.linalg.norm(residual_of(poses, vertices[None]))))
         if not np.isfinite(history[-1]):
             return ThesisEstimate(
                 rigidity, np.array(path), np.array(history), Result.fit_not_finite

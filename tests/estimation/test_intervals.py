@@ -2,21 +2,18 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import EXACT
 
 import jaxdeform as jd
-from jaxdeform._estimation.intervals import (
-    curvature,
-    log_intervals,
-    look_the_same,
-    profile_cost,
-    verdict,
-)
+from jaxdeform._estimation.deformed import PoseDerivatives
+from jaxdeform._estimation.intervals import has_settled, log_intervals, profile_cost
+from jaxdeform._estimation.noise import HandleNoise
 from jaxdeform._estimation.part_model import PartModel
-from jaxdeform._estimation.poses import PoseDerivatives, Poses
+from jaxdeform._estimation.poses import Poses
+from jaxdeform._estimation.spectrum import Spread
+from jaxdeform._estimation.verdict import in_words
 
 POSES = 20
 
@@ -26,14 +23,13 @@ class LinearModel(PartModel):
 
     slopes: np.ndarray
 
-    def fit(self, theta, modes):
+    def fit(self, theta, noise):
         vertices = self.slopes @ theta
         counted = self.poses.counted[..., None]
         residual = np.where(counted, vertices - self.poses.observed, 0.0)
         jacobian = np.where(counted[..., None], self.slopes, 0.0)
-        return self.weighted(
-            theta, PoseDerivatives(*map(jnp.asarray, (vertices, jacobian, residual))), modes
-        )
+        found = PoseDerivatives(vertices, jacobian, residual, np.zeros_like(residual))
+        return self.weighted(theta, found, noise)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +43,8 @@ def linear_model(problem, influence) -> LinearModel:
     free = np.broadcast_to(np.asarray(problem.system.free), (POSES, 9))
     slopes = draw.standard_normal((POSES, 9, 3, 2)) * influence
     observed = slopes @ np.zeros(2) + 0.01 * draw.standard_normal((POSES, 9, 3))
-    poses = Poses(np.zeros((POSES, 6, 3)), np.where(free[..., None], observed, 0.0), free)
+    observed = np.where(free[..., None], observed, 0.0)
+    poses = Poses(np.zeros((POSES, 6, 3)), observed, free, observed)
     label = np.array([0, 0, 0, 0, 1, 1, 1, 1, 1])
     model = LinearModel.build(problem, poses, label, jd.QuasiNewton(), jd.Implicit())
     model = replace(model, size=np.ones(2))
@@ -56,82 +53,87 @@ def linear_model(problem, influence) -> LinearModel:
 
 
 def best_fit(model: LinearModel):
-    """Return the fit at the least-squares solution, and the classical half-widths of 95 %."""
+    """Return the fit at the least-squares solution, and the classical spread of 95 %."""
     counted = model.poses.counted
     slopes, seen = model.slopes[counted].reshape(-1, 2), model.poses.observed[counted].ravel()
     theta, (cost,), *_ = np.linalg.lstsq(slopes, seen)
-    variance = cost / (len(seen) - 2)
-    widths = 1.959964 * np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes)))
-    return model.fit(theta, None), widths
+    inverse = np.diag(np.linalg.inv(slopes.T @ slopes))
+    widths = 1.959964 * np.sqrt(cost / (len(seen) - 2) * inverse)
+    return model.fit(theta, HandleNoise.none(model.poses)), Spread(widths, inverse)
 
 
-def test_curvature_gives_the_classical_interval(problem):
+def test_a_narrow_interval_is_that_of_the_linear_model(problem):
     model = linear_model(problem, [1.0, 0.1])
-    best, widths = best_fit(model)
-    linear = curvature(model, best, None)
-    np.testing.assert_allclose(linear.deviation, widths, rtol=1e-8)  # a ridge of 1e-16 tr(J^T J)
-    ends = log_intervals(model, best, None)
-    np.testing.assert_allclose(ends, best.theta[:, None] + np.outer(widths, [-1, 1]), rtol=1e-8)
+    best, classical = best_fit(model)
+    ends = log_intervals(model, best, classical)
+    expected = best.theta[:, None] + np.outer(classical.half_width, [-1, 1])
+    np.testing.assert_allclose(ends, expected, rtol=EXACT)
 
 
 def test_the_profile_fits_the_other_part_anew(problem):
     """A linear model's profile is the parabola of the inverse's diagonal."""
     model = linear_model(problem, [1.0, 0.1])
-    best, _ = best_fit(model)
-    inverse = np.diag(np.linalg.inv(best.normal))
+    best, classical = best_fit(model)
     for part, move in ((0, 0.3), (1, -2.0)):
-        cost = profile_cost(model, best, None, part, best.theta[part] + move)
-        np.testing.assert_allclose(cost, best.cost + move**2 / inverse[part], rtol=1e-8)
+        cost = profile_cost(model, best, part, best.theta[part] + move)
+        expected = best.cost + move**2 / classical.inverse[part]
+        np.testing.assert_allclose(cost, expected, rtol=1e-8)
 
 
 def test_a_wide_interval_is_followed_to_both_ends(problem):
     model = linear_model(problem, [1.0, 1e-3])
-    best, widths = best_fit(model)
-    assert widths[1] > 0.5
-    ends = log_intervals(model, best, None)[1]
-    assert np.abs(ends - best.theta[1] - widths[1] * np.array([-1, 1])).max() < 0.05  # as promised
+    best, classical = best_fit(model)
+    assert classical.half_width[1] > 0.5
+    ends = log_intervals(model, best, classical)[1]
+    off = ends - best.theta[1] - classical.half_width[1] * np.array([-1, 1])
+    assert np.abs(off).max() < 0.05  # as promised
 
 
-@pytest.mark.parametrize("influence", [0.0, 1e-9, 1e-7])
+@pytest.mark.parametrize("influence", [1e-9, 1e-7])
 def test_a_part_without_influence_has_no_ends(problem, influence):
     model = linear_model(problem, [1.0, influence])
-    best, widths = best_fit(linear_model(problem, [1.0, 1.0]))
-    best = model.fit(best.theta, None)
-    ends = log_intervals(model, best, None)
+    best, classical = best_fit(model)
+    best = model.fit(np.array([best.theta[0], 0.0]), best.noise)
+    ends = log_intervals(model, best, classical)
     assert ends[1].tolist() == [-np.inf, np.inf]
-    np.testing.assert_allclose(ends[0, 1] - ends[0, 0], 2 * widths[0], rtol=0.05)
+    np.testing.assert_allclose(ends[0, 1] - ends[0, 0], 2 * classical.half_width[0], rtol=0.05)
 
 
-def test_what_looks_the_same_is_a_matter_of_the_tolerance(problem):
-    """From 1 a part goes down by ln 1e7 = 16.1 and up by ln 1e5 = 11.5."""
-    model = linear_model(problem, [1e-2, 1e-4])
-    fit = model.fit(np.zeros(2), None)
-    farthest = np.linalg.norm(model.slopes[model.poses.counted], axis=1).max(axis=0)
-    moved = farthest[:, None] * np.log([1e7, 1e5])
-    for tolerance in (0.5 * moved.min(), 0.5 * moved.max(), moved[0].mean(), 2.0 * moved.max()):
-        np.testing.assert_array_equal(look_the_same(model, fit, tolerance), moved <= tolerance)
+def test_a_search_that_stopped_early_has_not_settled(problem):
+    model = linear_model(problem, [1.0, 0.1])
+    best, classical = best_fit(model)
+    assert has_settled(model, best, classical)
+    for part in range(2):
+        theta = best.theta.copy()
+        theta[part] += classical.half_width[part]
+        assert not has_settled(model, model.fit(theta, best.noise), classical)
+
+
+V = jd.Verdict
 
 
 @pytest.mark.parametrize(
-    ("interval", "same", "expected"),
+    ("interval", "factor", "expected", "words"),
     [
-        ((0.5, 2.0), (False, False), "determined"),
-        ((0.5, 2.0), (False, True), "at least 0.5"),
-        ((0.5, np.inf), (False, False), "at least 0.5"),
-        ((0.0, 2.0), (False, False), "at most 2"),
-        ((0.5, 2.0), (True, False), "at most 2"),
-        ((0.0, np.inf), (False, False), "not determined by these poses"),
-        ((0.5, 2.0), (True, True), "not determined by these poses"),
+        ((0.5, 2.0), 10.0, V.determined, "1 (0.5 to 2)"),
+        ((0.5, 2.0), 1.5, V.not_determined, "not determined by these poses"),
+        ((0.9, 2.0), 1.5, V.at_least, "at least 0.9"),
+        ((0.5, np.inf), 10.0, V.at_least, "at least 0.5"),
+        ((0.01, 2.0), 10.0, V.at_most, "at most 2"),
+        ((0.0, 2.0), 10.0, V.at_most, "at most 2"),
+        ((0.0, np.inf), 10.0, V.not_determined, "not determined by these poses"),
     ],
 )
-def test_verdicts(interval, same, expected):
-    assert verdict(np.array(interval), np.array(same)) == expected
+def test_verdicts_follow_from_the_interval(interval, factor, expected, words):
+    verdict = V.of(1.0, np.array(interval), factor)
+    assert verdict is expected
+    assert in_words(verdict, 1.0, np.array(interval)) == words
 
 
 def test_the_search_needs_only_the_triangle(problem):
     """The QR decomposition keeps cost, gradient and curvature of the whole residual."""
     model = linear_model(problem, [1.0, 0.1])
-    fit = model.fit(np.array([0.3, -0.2]), None)
+    fit = model.fit(np.array([0.3, -0.2]), HandleNoise.none(model.poses))
     jacobian = fit.jacobian.reshape(-1, 2)
     np.testing.assert_allclose(fit.normal, jacobian.T @ jacobian, rtol=EXACT)
     np.testing.assert_allclose(fit.cost, np.sum(fit.residual**2), rtol=EXACT)

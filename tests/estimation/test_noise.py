@@ -7,15 +7,17 @@ import pytest
 from helpers import EXACT, FD, THESIS
 
 import jaxdeform as jd
-from jaxdeform._estimation.noise import handle_modes, sandwich, whiten
-from jaxdeform._estimation.poses import Poses, deform_all
+from jaxdeform._estimation.deformed import deform_all
+from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
+from jaxdeform._estimation.poses import Poses
 
 
 @pytest.mark.slow
 def test_derivatives_agree_three_ways(bar_problem, bar_targets, halves):
     """Finite differences, unrolled, and (where converged) implicit."""
     n = len(halves)
-    poses = Poses(bar_targets[None], np.zeros((1, n, 3)), np.ones((1, n), bool))
+    start = np.asarray(jd.deform(bar_problem, bar_targets, 1.0).vertices)[None]
+    poses = Poses(bar_targets[None], np.zeros((1, n, 3)), np.ones((1, n), bool), start)
     theta, h = np.log([0.5, 20.0]), 1e-4
 
     def run(theta, solver, adjoint):
@@ -37,39 +39,48 @@ def test_whitening_twice_is_the_inverse_covariance(size):
     draw = np.random.default_rng(0)
     modes = size * draw.standard_normal((2, 30, 4))
     columns = draw.standard_normal((2, 30, 3))
+    noise = HandleNoise(*np.linalg.svd(modes, full_matrices=False)[:2])
     covariance = np.eye(30) + modes @ np.swapaxes(modes, 1, 2)
-    once = whiten(columns, modes)
-    np.testing.assert_allclose(
-        whiten(once, modes), np.linalg.solve(covariance, columns), atol=EXACT
-    )
+    once = noise.whiten(columns)
+    np.testing.assert_allclose(noise.whiten(once), np.linalg.solve(covariance, columns), atol=EXACT)
     products = np.swapaxes(columns, 1, 2) @ np.linalg.solve(covariance, columns)
     np.testing.assert_allclose(np.swapaxes(once, 1, 2) @ once, products, atol=EXACT)
-    assert whiten(columns, None) is columns
+
+
+def test_unbounded_noise_leaves_nothing_along_its_directions():
+    draw = np.random.default_rng(0)
+    modes = draw.standard_normal((2, 30, 4))
+    noise = HandleNoise(*np.linalg.svd(modes, full_matrices=False)[:2]).unbounded
+    columns = noise.whiten(draw.standard_normal((2, 30, 3)))
+    np.testing.assert_allclose(np.swapaxes(modes, 1, 2) @ columns, 0.0, atol=EXACT)
+    np.testing.assert_allclose(noise.whiten(columns), columns, atol=EXACT)
+    assert noise.free.shape == (2, 10, 3, 4)
+
+
+def test_exact_targets_change_nothing():
+    seen = np.zeros((2, 10, 3))
+    poses = Poses(np.zeros((2, 4, 3)), seen, np.ones((2, 10), bool), seen)
+    columns = np.random.default_rng(0).standard_normal((2, 30, 3))
+    noise = HandleNoise.none(poses)
+    np.testing.assert_array_equal(noise.whiten(columns), columns)
+    assert noise.free.shape == (2, 10, 3, 0)
 
 
 @pytest.mark.slow
 def test_handle_noise_against_the_dense_covariance():
-    """W = (I + U U^T)^-1 is exact where the modes are all; then the sandwich is J^T W J."""
+    """Four handles have 12 directions, all of which are found."""
     mesh = jd.shapes.square()
     problem = jd.precompute(mesh, [0, 2, 6, 8])
     targets = np.asarray(jd.twist(mesh.vertices[problem.handles], 60.0, along="y"))
     free = np.asarray(problem.system.free)[None]
-    poses = Poses(targets[None], np.zeros((1, 9, 3)), free)
+    pose = np.asarray(jd.deform(problem, targets, 0.3).vertices)[None]
+    poses = Poses(targets[None], np.zeros((1, 9, 3)), free, pose)
     field, solver = np.full(9, 0.3), jd.QuasiNewton()
     dense = jax.jacrev(
         lambda t: jnp.where(free[0][:, None], jd.deform(problem, t, field).vertices, 0.0)
     )(jnp.asarray(targets))
     dense = np.asarray(dense).reshape(27, 12)
-    covariance = np.eye(27) + dense @ dense.T
-    modes = np.asarray(handle_modes(problem, poses, field, solver, jd.Implicit()))
-    # As exact as the deformation has converged.
-    np.testing.assert_allclose(modes[0] @ modes[0].T, dense @ dense.T, atol=1e-4)
-    columns = np.random.default_rng(0).standard_normal((1, 9, 3, 2)) * free[..., None, None]
-    flat = columns.reshape(1, 27, 2)
-    expected = np.linalg.solve(covariance, flat[0])
-    weighted = whiten(whiten(flat, modes), modes)
-    np.testing.assert_allclose(weighted[0], expected, atol=1e-4)
-    freedom, meat = sandwich(problem, poses, field, columns, modes, solver, jd.Implicit())
-    np.testing.assert_allclose(meat, flat[0].T @ expected, rtol=1e-3)
-    # tr(W S) is the number of coordinates; Hutchinson's eight probes leave little here.
-    assert abs(freedom + 2 - 3 * free.sum()) < 0.5
+    for relative in (1.0, 0.5):
+        noise = find_handle_noise(problem, poses, field, solver, jd.Implicit(), relative)
+        found = (noise.basis[0] * noise.size[0] ** 2) @ noise.basis[0].T
+        np.testing.assert_allclose(found, relative**2 * dense @ dense.T, atol=1e-6)
