@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from benchmarks.metrics import Findings
 from benchmarks.suites import (
+    accelerator,
     batch,
     cactus,
     convergence,
@@ -31,4 +32,5 @@ SUITES: dict[str, Callable[[bool], Findings]] = {
     "scaling": scaling.run,
     "memory": memory.run,
     "derivatives": derivatives.run,
+    "accelerator": accelerator.run,
 }

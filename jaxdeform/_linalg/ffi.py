@@ -2,7 +2,7 @@
 
 XLA calls a C function with the address of one struct. ctypes makes that function here. The layout
 of the structs is that of the header, so it is the one that XLA was compiled with (version 0.1 in
-jax 0.7, 0.3 in jax 0.10).
+jax 0.7, 0.3 in jax 0.10, 0.4 in jax 0.11).
 """
 
 import ctypes
@@ -25,8 +25,7 @@ _FIELDS = {
     # One operand or result: a dense array, row-major.
     "Buffer": {"dtype", "data", "rank", "dims"},
     # The question for the version, and the answer.
-    "Extension_Base": {"type"},
-    "Metadata_Extension": {"metadata"},
+    "Metadata_Extension": {"extension_base", "metadata"},
     "Metadata": {"api_version", "traits"},
     "Api_Version": {"major_version", "minor_version"},
     # XLA's functions, of which one makes an error, and the argument of that one.
@@ -54,7 +53,9 @@ class Interface:
         self.version = [int(self._find(rf"XLA_FFI_API_{x} (\d+)")) for x in ("MAJOR", "MINOR")]
         if self.version[0] != 0:
             raise LookupError(f"major version {self.version[0]}")
-        for name, wanted in _FIELDS.items():
+        # What an extension begins with: Extension_Base up to version 0.3, then InternalExtension.
+        self._base = self._find(r"XLA_FFI_(\w+) extension_base;")
+        for name, wanted in {**_FIELDS, self._base: {"type"}}.items():
             if not wanted <= {field[0] for field in self[name]._fields_}:
                 raise LookupError(f"{name} without one of {wanted}")
         self.dtypes = {self.code(f"DataType_{x}"): np.dtype(y) for x, y in _DTYPES.items()}
@@ -124,7 +125,7 @@ class Interface:
 
     def _answers(self, address: int | None) -> bool:
         """Whether this was the question for the version, which has been answered now."""
-        if not address or self["Extension_Base"].from_address(address).type != self.metadata:
+        if not address or self[self._base].from_address(address).type != self.metadata:
             return False
         extension = self["Metadata_Extension"].from_address(address)
         metadata = self["Metadata"].from_address(extension.metadata)

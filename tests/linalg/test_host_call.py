@@ -118,6 +118,14 @@ def test_layout_of_the_first_version():
     assert [name for name, *_ in Interface(first)["Metadata"]._fields_][-1] == "traits"
 
 
+@pytest.mark.parametrize("name", ["Extension_Base", "InternalExtension"])
+def test_the_base_of_an_extension_has_two_names(name):
+    """Version 0.4, in jax 0.11, calls it InternalExtension."""
+    header = re.sub(r"XLA_FFI_(Extension_Base|InternalExtension)\b", f"XLA_FFI_{name}", HEADER)
+    base = dict(Interface(header)["Metadata_Extension"]._fields_)["extension_base"]
+    assert base.__name__ == name
+
+
 @pytest.mark.parametrize(
     ("pattern", "replacement"),
     [
