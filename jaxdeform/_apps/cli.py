@@ -25,6 +25,7 @@ from jaxdeform._apps.arguments import make_folder, read_parts, read_pose, read_r
 from jaxdeform._apps.mouth import Mouth
 from jaxdeform._apps.results import as_json, save_result
 from jaxdeform._errors import printable
+from jaxdeform._estimation.held_out import prediction_errors
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
 from jaxdeform._mesh.writing import check_place, write_atomically
 from jaxdeform._plotting import check_picture_path
@@ -252,8 +253,20 @@ def estimate(
         int | None,
         typer.Option(min=1, help="Number of alternating steps. By default, until convergence."),
     ] = None,
+    hold_out: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Leave out so many poses, the last ones, and report how well they are predicted, "
+            "beside ARAP. Found handles are those of all poses.",
+        ),
+    ] = 0,
 ) -> None:
     """Estimate the rigidity of a mesh or of its parts from deformed poses."""
+    if hold_out >= len(poses):
+        raise jd.InputError(
+            f"--hold-out {hold_out} leaves none of the {len(poses)} poses to fit: give fewer"
+        )
     shape = jd.load_mesh(rest)
     check_output(out)
     report = without_suffix(out).with_suffix(".json")
@@ -271,10 +284,11 @@ def estimate(
         "precomputing", lambda: jd.precompute(shape, index, cells=jd.rings(shape, rings))
     )
     solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
+    fitted, kept = np.split(observed, [len(poses) - hold_out])
     fit = _patiently(
         "estimating",
         lambda: jd.estimate_rigidity(
-            problem, observed, parts=label, solver=solver, progress=_show_evaluation
+            problem, fitted, parts=label, solver=solver, progress=_show_evaluation
         ),
     )
     jd.save_mesh(out, shape, rigidity=fit.field)
@@ -282,7 +296,26 @@ def estimate(
     write_atomically(report, f"{text}\n".encode())
     console.print(fit.explain())
     console.print(f"estimated in {_since(began)}")
+    if hold_out:
+        _report_held_out(problem, kept, poses[-hold_out:], fit.field)
     _say_wrote(out, report)
+
+
+def _report_held_out(
+    problem: jd.Problem, observed: np.ndarray, names: list[Path], field: np.ndarray
+) -> None:
+    """Predict poses that were not fitted, by the estimate and by ARAP."""
+    table = Table("held out", "error, % of the diagonal", "ARAP")
+    ours, arap = _patiently(
+        "predicting",
+        lambda: (
+            prediction_errors(problem, observed, field, jd.Newton()),
+            prediction_errors(problem, observed, 0.0, jd.RotationFit()),
+        ),
+    )
+    for name, mine, rigid in zip(names, ours, arap, strict=True):
+        table.add_row(printable(name.name), f"{100 * mine:.3g}", f"{100 * rigid:.3g}")
+    console.print(table)
 
 
 def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.ndarray:

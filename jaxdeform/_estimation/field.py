@@ -5,6 +5,7 @@ rigidity along the edges, whose squares add up to the prior.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,16 +13,24 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxdeform._checks import check_count, check_function, check_tolerance
+from jaxdeform._deformation.adjoint import Implicit
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._errors import ArrayLike
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
 from jaxdeform._estimation.deformed import pose, states
+from jaxdeform._estimation.evidence import (
+    Evidence,
+    Patterns,
+    deviations,
+    find_patterns,
+    most_probable,
+)
+from jaxdeform._estimation.field_prior import Prior, Solve, WithPrior
 from jaxdeform._estimation.poses import (
     Poses,
     check_poses,
@@ -30,36 +39,50 @@ from jaxdeform._estimation.poses import (
     same_length,
 )
 from jaxdeform._estimation.search import Found, search
-from jaxdeform._linalg.cholesky import Factor, factorise
-from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian, lifted_weights
 from jaxdeform._result import Result, succeeded
 
-# Half-width of the 95 % interval of the normal distribution, in standard deviations.
-_NORMAL_95 = 1.959964
-# Conjugate gradients of one Gauss-Newton step, which need not be exact.
-_CG_TOLERANCE, _CG_STEPS = 1e-2, 60
 # The prior is strong at first and weakens by this factor a stage.
 _STRONGEST, _RELAX = 1e-2, 0.1
-# Evaluations of a stage; the relative gain below which a stage ends, and below which the last does.
-_STAGE_EVALUATIONS, _STAGE_GAIN, _LAST_GAIN = 2, 1e-3, 1e-6
-# Standard deviations from this many samples are good to 12 %.
-_SAMPLES = 32
+# The weight at which the most probable one is first asked for.
+_FIRST = 1e-5
+# Evaluations of a stage, and the relative gain below which it ends: of 1,000 coordinates, that is
+# the share of one.
+_STAGE_EVALUATIONS, _GAIN = 2, 1e-3
+# The smoothness that the poses make most probable is sought between these, anew at most so often,
+# until it changes by less than a factor.
+_SMOOTHEST, _ROUGHEST, _ROUNDS, _SAME = 1e-1, 1e-12, 3, 2.0
+# A step to 1e-2 and patterns need no exact derivatives: half the time of the default.
+_ADJOINT = Implicit(tolerance=1e-5)
+# Half-width of the 95 % interval of the normal distribution, in standard deviations.
+_NORMAL_95 = 1.959964
 
 
-class FieldEstimate(NamedTuple):
-    """A rigidity per vertex, as :func:`estimate_rigidity_field` finds it."""
+@dataclass(frozen=True, eq=False)
+class FieldEstimate:
+    """A rigidity per vertex, as :func:`estimate_rigidity_field` finds it.
+
+    - field: (vertices,) the rigidity of each vertex; its unit is length squared.
+    - interval: (vertices, 2) 95 % interval of each, under the prior.
+    - determined: (vertices,) True where the interval is within a factor of ten to both sides. Where
+      it is not, the poses say next to nothing, and the value is that of the neighbors.
+    - smoothness: weight of the prior, as given or as chosen.
+    - noise: standard deviation of a coordinate that the poses have under this prior (a length).
+    - vertices: (poses, vertices, 3) the fitted poses.
+    - misfit: root mean square of the differences between fitted and observed coordinates (a
+      length).
+    - history: (evaluations,) misfit of each evaluation, accepted or not.
+    - result: how the search ended, a member of :class:`Result`.
+    """
 
     field: Float[np.ndarray, "vertices"]
     interval: Float[np.ndarray, "vertices 2"]
-    """95 % interval under the prior: wide where only the neighbors say something."""
+    determined: Bool[np.ndarray, "vertices"]
+    smoothness: float
+    noise: float
     vertices: Float[np.ndarray, "poses vertices 3"]
-    """The fitted poses."""
     misfit: float
-    """Root mean square of the differences between fitted and observed coordinates (a length)."""
     history: Float[np.ndarray, "evaluations"]
-    """Misfit of each evaluation, accepted or not."""
     result: Result
-    """How the search ended: a member of :class:`Result`."""
 
     @property
     def ok(self) -> bool:
@@ -71,7 +94,7 @@ def estimate_rigidity_field(
     problem: Problem,
     observed: ArrayLike,
     *,
-    smoothness: float = 1e-8,
+    smoothness: float | None = None,
     targets: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
@@ -93,10 +116,10 @@ def estimate_rigidity_field(
 
     - problem, observed, targets, mask, solver, adjoint, max_evaluations, progress: as
       :func:`estimate_rigidity`.
-    - smoothness: weight of the prior. The most probable field has it equal to
-      ``(noise / (diagonal * slope))^2``, with the standard deviation of the noise of a coordinate
-      and of the difference of log rigidity between neighbours. The default is noise of 1e-4 of the
-      bounding box diagonal and slope 1. More smooths.
+    - smoothness: weight of the prior. Left out, it is the one under which the poses are most
+      probable (marginal likelihood): ``(noise / (diagonal * slope))^2``, with the standard
+      deviation of the noise of a coordinate and of the difference of log rigidity between
+      neighbors. More smooths.
     - start: a number or (n,); a medium material if left out.
 
     **Returns** a :class:`FieldEstimate`. Its interval takes targets as exact.
@@ -113,38 +136,32 @@ def estimate_rigidity_field(
         (9,)
     """
     # Without smoothness, vertices that the poses say nothing about would have no value.
-    check_tolerance("smoothness", smoothness, positive=True)
+    if smoothness is not None:
+        check_tolerance("smoothness", smoothness, positive=True)
     check_count("max_evaluations", max_evaluations)
     check_function("progress", progress, "evaluation, misfit, rigidity")
+    adjoint = choose_adjoint(solver, adjoint or (None if solver.can_unroll else _ADJOINT))
     poses = check_poses(problem, observed, targets, mask)
-    adjoint = choose_adjoint(solver, adjoint)
     size = _sizes(problem)
-    bounds = log_bounds(size).astype(problem.dtype)
     medium = np.full(len(size), 0.1 * np.median(size))
+    bounds = log_bounds(size).astype(problem.dtype)
     theta = np.clip(np.log(check_start(start, medium, "vertex")), *bounds)
-    prior = _prior(problem)
-    history: list[float] = []
-
-    def evaluate(theta: np.ndarray) -> _Linearised:
-        run = _linearise(problem, poses, jnp.asarray(theta, problem.dtype), solver, adjoint)
-        history.append(poses.root_mean_square(np.asarray(run.residual)))
-        if progress is not None:
-            progress(len(history), history[-1], np.exp(theta))
-        return run
-
-    weights = problem.mesh.diagonal**2 * _stages(smoothness)
-    left = lambda: max_evaluations - len(history)  # noqa: E731
-    best, result = _search_in_stages(evaluate, theta, bounds, prior, weights, left)
-    misfit = poses.root_mean_square(np.asarray(best.run.residual))
-    noise = max(misfit, same_length(problem))
-    deviation = _NORMAL_95 * noise * np.asarray(_spread(best.evaluation, best.solve))
-    theta = np.asarray(best.run.theta, np.float64)
+    found = _Search(problem, poses, bounds, solver, adjoint, max_evaluations, progress)
+    best, weight, result = found.run(theta, smoothness)
+    patterns = find_patterns(best, found.prior)
+    noise = found.evidence(patterns, (weight, weight)).noise
+    spread = deviations(patterns, found.prior.variances(), Evidence(weight, noise))
+    theta = np.asarray(best.theta, np.float64)
+    ends = _NORMAL_95 * spread[:, None] * np.array([-1.0, 1.0])
     return FieldEstimate(
         field=np.exp(theta),
-        interval=np.exp(theta[:, None] + deviation[:, None] * np.array([-1.0, 1.0])),
-        vertices=np.asarray(best.run.vertices),
-        misfit=misfit,
-        history=np.array(history),
+        interval=np.exp(theta[:, None] + ends),
+        determined=ends[:, 1] <= np.log(10.0),
+        smoothness=weight / problem.mesh.diagonal**2,
+        noise=noise,
+        vertices=np.asarray(best.vertices),
+        misfit=poses.root_mean_square(np.asarray(best.residual)),
+        history=np.array(found.history),
         result=result,
     )
 
@@ -165,26 +182,57 @@ def _stages(smoothness: float) -> Float[np.ndarray, "stages"]:
     return np.append(_STRONGEST * _RELAX ** np.arange(count), smoothness)
 
 
-def _search_in_stages(
-    evaluate: Callable[[np.ndarray], "_Linearised"],
-    theta: np.ndarray,
-    bounds: np.ndarray,
-    prior: "_Prior",
-    weights: np.ndarray,
-    left: Callable[[], int],
-) -> Found:
-    """Search under one weight after the other, the last to the end."""
-    run = evaluate(theta)
-    for weight in weights[:-1]:
-        found = _search_stage(evaluate, run, bounds, prior, weight, _STAGE_GAIN, _STAGE_EVALUATIONS)
-        run = found.best.run
-    return _search_stage(evaluate, run, bounds, prior, weights[-1], _LAST_GAIN, left())
+class _Search:
+    """The search, under one weight of the prior after the other."""
 
+    def __init__(self, problem, poses, bounds, solver, adjoint, limit: int, progress) -> None:
+        self.problem, self.poses, self.bounds = problem, poses, bounds
+        self.solver, self.adjoint, self.limit, self.progress = solver, adjoint, limit, progress
+        self.prior = Prior.of(problem)
+        self.history: list[float] = []
 
-def _search_stage(evaluate, run, bounds, prior, weight, gain, limit) -> Found:
-    first = _FieldFit(run, prior, jnp.asarray(weight, run.theta.dtype))
-    solver = ray_solver(bounds[0], bounds[1], first.solve, gain)
-    return search(lambda theta: first._replace(run=evaluate(theta)), first, solver, limit)
+    def run(self, theta, smoothness: float | None) -> "tuple[_Linearised, float, Result]":
+        """Return the last evaluation, the weight of the prior, and how the search ended."""
+        unit = self.problem.mesh.diagonal**2
+        first = self._evaluate(theta)
+        if smoothness is not None:
+            return self._relax(first, unit * _stages(smoothness))
+        found = self._relax(first, unit * _stages(_FIRST))
+        for _ in range(_ROUNDS):
+            run, weight, result = found
+            ends = unit * _ROUGHEST, unit * _SMOOTHEST
+            better = self.evidence(find_patterns(run, self.prior), ends).weight
+            if max(better / weight, weight / better) < _SAME or not succeeded(result):
+                break
+            # Down by the stages that are left; up at once.
+            stages = weight * _RELAX ** np.arange(1, np.log(weight / better) / -np.log(_RELAX))
+            found = self._relax(run, np.append(stages, better))
+        return found
+
+    def evidence(self, patterns: Patterns, ends: tuple[float, float]) -> Evidence:
+        """Return the most probable weight and noise."""
+        return most_probable(patterns, self.poses.count, same_length(self.problem), ends)
+
+    def _relax(self, run, weights) -> "tuple[_Linearised, float, Result]":
+        """Search under each weight, under the last to the end."""
+        for weight in weights[:-1]:
+            run = self._descend(run, weight, _STAGE_EVALUATIONS).best.run
+        left = self.limit - len(self.history)
+        found = self._descend(run, weights[-1], max(left, 0))
+        return found.best.run, float(weights[-1]), found.result
+
+    def _descend(self, run, weight, limit: int) -> Found:
+        first = _FieldFit(run, self.prior, jnp.asarray(weight, run.theta.dtype))
+        solver = ray_solver(self.bounds[0], self.bounds[1], first.solve, _GAIN)
+        return search(lambda theta: first._replace(run=self._evaluate(theta)), first, solver, limit)
+
+    def _evaluate(self, theta: np.ndarray) -> "_Linearised":
+        point = jnp.asarray(theta, self.problem.dtype)
+        run = _linearise(self.problem, self.poses, point, self.solver, self.adjoint)
+        self.history.append(self.poses.root_mean_square(np.asarray(run.residual)))
+        if self.progress is not None:
+            self.progress(len(self.history), self.history[-1], np.exp(theta))
+        return run
 
 
 # ---------------------------------------------------------------- the linear model
@@ -218,106 +266,21 @@ def _linearise_at(problem, poses: Poses, theta, state, solver, adjoint) -> _Line
     return _Linearised(theta, vertices, residual, jacobian)
 
 
-class _Prior(NamedTuple):
-    """The Laplacian of log rigidity, as a sum over the edges."""
-
-    root: Float[Array, "edges"]
-    """Square roots of the edge weights."""
-    edges: Int[Array, "edges 2"]
-    factor: Factor
-    """Of the Laplacian, made definite: the preconditioner."""
-
-    def differences(self, theta: Float[Array, "vertices"]) -> Float[Array, "edges"]:
-        """Return weighted differences: the sum of their squares is the prior."""
-        return self.root * (theta[self.edges[:, 0]] - theta[self.edges[:, 1]])
-
-
-class _WithPrior(eqx.Module):
-    """The derivative of the residual with the prior below it."""
-
-    data: lx.FunctionLinearOperator
-    prior: _Prior
-    weight: Float[Array, ""]
-
-    def mv(self, vector):
-        """Return the product with a change of log rigidity."""
-        return self.data.mv(vector), jnp.sqrt(self.weight) * self.prior.differences(vector)
-
-
-class _Solve(eqx.Module):
-    """Solves for the Gauss-Newton step by conjugate gradients, which the Laplacian preconditions.
-
-    lineax's CG was tried: CG_NOTE
-    """
-
-    factor: Factor
-    weight: Float[Array, ""]
-
-    def __call__(self, jacobian: lx.AbstractLinearOperator, residual) -> Float[Array, "vertices"]:
-        """Return the step."""
-        transposed = jacobian.transpose()
-        product = lambda x: transposed.mv(jacobian.mv(x))  # noqa: E731
-        precondition = lambda r: self.factor.solve(r) / self.weight  # noqa: E731
-        right = -transposed.mv(residual)
-        return jax.scipy.sparse.linalg.cg(
-            product, right, tol=_CG_TOLERANCE, maxiter=_CG_STEPS, M=precondition
-        )[0]
-
-
 class _FieldFit(NamedTuple):
     """One evaluation under the prior of a stage."""
 
     run: _Linearised
-    prior: _Prior
+    prior: Prior
     weight: Float[Array, ""]
 
     @property
-    def solve(self) -> _Solve:
+    def solve(self) -> Solve:
         """Return what solves for the step."""
-        return _Solve(self.prior.factor, self.weight)
+        return Solve(self.prior.factor, self.weight)
 
     @property
     def evaluation(self) -> Evaluation:
         """The linear model as the search takes it."""
         theta, _, residual, jacobian = self.run
         rough = jnp.sqrt(self.weight) * self.prior.differences(theta)
-        return Evaluation(theta, (residual, rough), _WithPrior(jacobian, self.prior, self.weight))
-
-
-@eqx.filter_jit
-def _spread(evaluation: Evaluation, solve: Callable) -> Float[Array, "vertices"]:
-    """Return the standard deviations of log rigidity for noise of size 1, from samples.
-
-    For normal noise a, H^-1 J^T a has the covariance H^-1, where H = J^T J and J has the prior
-    below it.
-    """
-    theta = evaluation.point
-    jacobian = lx.FunctionLinearOperator(evaluation.jacobian.mv, jax.eval_shape(lambda: theta))
-    leaves, tree = jax.tree.flatten(evaluation.residual)
-
-    def sample(key):
-        keys = jax.random.split(key, len(leaves))
-        noise = [
-            jax.random.normal(key, leaf.shape, leaf.dtype)
-            for key, leaf in zip(keys, leaves, strict=True)
-        ]
-        return solve(jacobian, jax.tree.unflatten(tree, noise))
-
-    samples = jax.lax.map(sample, jax.random.split(jax.random.key(0), _SAMPLES))
-    return jnp.sqrt(jnp.mean(samples**2, axis=0))
-
-
-# ---------------------------------------------------------------- the prior
-
-
-def _prior(problem: Problem) -> _Prior:
-    mesh = problem.mesh
-    # Negative weights would reward differences.
-    weights = lifted_weights(cotangent_weights(mesh))
-    laplacian = graph_laplacian(mesh.edges, weights, mesh.n_vertices)
-    # Constants cost nothing; the preconditioner needs them to cost a little.
-    shifted = laplacian + 1e-2 * sp.identity(mesh.n_vertices)
-    everywhere = np.ones(mesh.n_vertices, bool)
-    factor = factorise(shifted.tocsr(), everywhere, problem.dtype, positions=mesh.vertices)
-    root = jnp.asarray(np.sqrt(weights), problem.dtype)
-    return _Prior(root, jnp.asarray(mesh.edges, jnp.int32), factor)
+        return Evaluation(theta, (residual, rough), WithPrior(jacobian, self.prior, self.weight))

@@ -1,4 +1,6 @@
-"""Smooth fields: the prior, the step and the intervals by themselves, and a field recovered."""
+"""Smooth fields: prior, step, evidence and intervals on linear problems, and fields recovered."""
+
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -6,23 +8,41 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
-from helpers import EXACT, ends
+from helpers import EXACT, ends, noisy
+from scipy.stats import multivariate_normal
 
 import jaxdeform as jd
-from jaxdeform._estimation.bounded_gauss_newton import Evaluation
-from jaxdeform._estimation.field import _prior, _Solve, _spread, _stages, _WithPrior
+from jaxdeform._estimation.evidence import (
+    Evidence,
+    deviations,
+    find_patterns,
+    most_probable,
+)
+from jaxdeform._estimation.field import _stages
+from jaxdeform._estimation.field_prior import Prior, Solve, WithPrior
 from jaxdeform._mesh.laplacian import graph_laplacian, lifted_weights
+
+# ---------------------------------------------------------------- the prior
+
+
+def laplacian_of(mesh):
+    weights = lifted_weights(jd.cotangent_weights(mesh))
+    return graph_laplacian(mesh.edges, weights, mesh.n_vertices).toarray()
 
 
 def test_the_prior_is_the_laplacian(bar, bar_problem):
-    prior = _prior(bar_problem)
+    prior = Prior.of(bar_problem)
     theta = np.random.default_rng(0).standard_normal(bar.n_vertices)
-    laplacian = graph_laplacian(
-        bar.edges, lifted_weights(jd.cotangent_weights(bar)), bar.n_vertices
-    )
+    laplacian = laplacian_of(bar)
     found = np.sum(np.asarray(prior.differences(jnp.asarray(theta))) ** 2)
     np.testing.assert_allclose(found, theta @ laplacian @ theta, rtol=EXACT)
     assert np.abs(prior.differences(jnp.ones(bar.n_vertices))).max() == 0.0
+    definite = laplacian + 0.01 * np.eye(bar.n_vertices)
+    vectors = np.random.default_rng(1).standard_normal((bar.n_vertices, 3))
+    np.testing.assert_allclose(
+        prior.product(jnp.asarray(vectors)), definite @ vectors, atol=EXACT * 100
+    )
+    np.testing.assert_allclose(prior.variances(), np.diag(np.linalg.inv(definite)), rtol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -45,18 +65,21 @@ def test_the_prior_never_rewards_differences():
     assert lifted_weights(jd.cotangent_weights(sliver)).min() > 0
 
 
+# ---------------------------------------------------------------- a linear problem
+
+
 @pytest.fixture(scope="module")
 def small():
     """A linear model of 9 unknowns with the prior below it, and its matrix."""
     problem = jd.precompute(jd.shapes.square(), [0, 1, 2, 6, 7, 8])
-    prior = _prior(problem)
+    prior = Prior.of(problem)
     data = jnp.asarray(np.random.default_rng(0).standard_normal((12, 9)))
     weight = jnp.asarray(2.0)
     shape = jax.ShapeDtypeStruct((9,), jnp.float64)
     operator = lx.FunctionLinearOperator(lambda x: data @ x, shape)
-    jacobian = _WithPrior(operator, prior, weight)
+    jacobian = WithPrior(operator, prior, weight)
     rows = jax.vmap(jacobian.mv, out_axes=-1)(jnp.eye(9))
-    return jacobian, np.concatenate(rows), _Solve(prior.factor, weight)
+    return jacobian, np.concatenate(rows), Solve(prior.factor, weight)
 
 
 def test_the_step_solves_the_normal_equations(small):
@@ -71,14 +94,75 @@ def test_the_step_solves_the_normal_equations(small):
     assert np.linalg.norm(matrix.T @ matrix @ step - right) <= 0.01 * np.linalg.norm(right)
 
 
-def test_the_spread_is_that_of_the_inverse(small):
-    """Of 32 samples: each deviation is good to 12 %."""
-    jacobian, matrix, solve = small
-    residual = jacobian.mv(jnp.zeros(9))
-    spread = np.asarray(_spread(Evaluation(jnp.zeros(9), residual, jacobian), solve))
-    exact = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
-    np.testing.assert_allclose(spread, exact, rtol=0.4)  # three standard errors
-    assert abs(np.mean((spread / exact) ** 2) - 1.0) < 0.25
+class Linear:
+    """Poses of the bumpy bar that answer linearly to the field, and what dense algebra says."""
+
+    def __init__(self, problem, draw, weight, noise):
+        n = problem.n_vertices
+        self.prior = Prior.of(problem)
+        self.definite = laplacian_of(problem.mesh) + 0.01 * np.eye(n)
+        # 10 vertices see the field through blurs, some clearly and some not at all.
+        blurs = draw.standard_normal((30, n)) @ np.linalg.inv(self.definite)
+        self.matrix = np.geomspace(1.0, 1e-4, 30)[:, None] * blurs
+        self.covariance = noise**2 / weight * np.linalg.inv(self.definite)
+        self.truth = np.linalg.cholesky(self.covariance) @ draw.standard_normal(n)
+        self.seen = self.matrix @ self.truth + noise * draw.standard_normal(30)
+        matrix = jnp.asarray(self.matrix)
+        self.run = SimpleNamespace(
+            theta=jnp.zeros(n),
+            residual=jnp.asarray(-self.seen).reshape(1, 10, 3),
+            jacobian=lx.FunctionLinearOperator(
+                lambda x: (matrix @ x).reshape(1, 10, 3), jax.ShapeDtypeStruct((n,), jnp.float64)
+            ),
+        )
+
+
+@pytest.fixture(scope="module")
+def linear(bar_problem):
+    return Linear(bar_problem, np.random.default_rng(0), 3.0, 0.1)
+
+
+def test_deviations_are_those_of_the_dense_posterior(linear):
+    patterns = find_patterns(linear.run, linear.prior)
+    found = deviations(patterns, linear.prior.variances(), Evidence(3.0, 0.1))
+    normal = linear.matrix.T @ linear.matrix + 3.0 * linear.definite
+    exact = 0.1 * np.sqrt(np.diag(np.linalg.inv(normal)))
+    np.testing.assert_allclose(found, exact, rtol=1e-6)
+
+
+def test_the_evidence_is_the_density_of_the_poses(linear):
+    """Against SciPy's density of a normal distribution, with noise and weight as given."""
+    patterns = find_patterns(linear.run, linear.prior)
+    logs = []
+    for weight in (0.3, 3.0, 30.0):
+        noise = most_probable(patterns, 30, 1e-12, (weight, weight)).noise
+        inner = linear.matrix @ np.linalg.solve(linear.definite, linear.matrix.T) / weight
+        exact = multivariate_normal.logpdf(linear.seen, cov=noise**2 * (np.eye(30) + inner))
+        logs.append((weight, exact))
+        for other in (0.9, 1.1):  # the noise is the most probable one
+            worse = multivariate_normal.logpdf(
+                linear.seen, cov=(other * noise) ** 2 * (np.eye(30) + inner)
+            )
+            assert worse < exact
+    best = most_probable(patterns, 30, 1e-12, (0.3, 30.0)).weight
+    assert max(logs, key=lambda pair: pair[1])[0] == min(
+        (0.3, 3.0, 30.0), key=lambda w: abs(np.log(w / best))
+    )
+
+
+def test_the_weight_and_the_noise_behind_the_poses_are_found(bar_problem):
+    """Over 20 draws; one draw of 30 coordinates tells the weight to a factor of about three."""
+    found = []
+    for seed in range(20):
+        linear = Linear(bar_problem, np.random.default_rng(seed), 3.0, 0.1)
+        patterns = find_patterns(linear.run, linear.prior)
+        found.append(most_probable(patterns, 30, 1e-12, (1e-3, 1e3)))
+    weights, noises = np.array(found).T
+    assert abs(np.median(np.log(weights / 3.0))) < 0.7
+    np.testing.assert_allclose(np.median(noises), 0.1, rtol=0.15)
+
+
+# ---------------------------------------------------------------- fields recovered
 
 
 @pytest.mark.slow
@@ -91,3 +175,18 @@ def test_a_smooth_field_is_recovered_from_three_poses(bar, bar_problem):
     assert len(ends(bar)) == len(points)
     fit = jd.estimate_rigidity_field(bar_problem, poses, smoothness=1e-9)
     assert np.median(np.abs(fit.field / true - 1)) < 0.1
+
+
+@pytest.mark.slow
+def test_the_smoothness_is_chosen_and_the_intervals_cover(bar, bar_problem, bar_targets):
+    """One pose, noise 1e-4: the field within a factor of 1.5, intervals that cover."""
+    true = 0.01 * 1000.0 ** (bar.vertices[:, 1] / 151.0)
+    pose = np.asarray(jd.deform(bar_problem, bar_targets, true).vertices)
+    fit = jd.estimate_rigidity_field(bar_problem, noisy(bar, pose, 0), targets=bar_targets)
+    free = np.asarray(bar_problem.system.free)
+    covered = (fit.interval[:, 0] <= true) & (true <= fit.interval[:, 1])
+    assert covered[free].mean() > 0.9
+    assert np.median(np.abs(np.log(fit.field / true))[free]) < 0.4
+    np.testing.assert_allclose(fit.noise, 1e-4 * bar.diagonal, rtol=0.1)
+    assert 1e-10 < fit.smoothness < 1e-6
+    assert fit.ok

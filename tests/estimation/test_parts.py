@@ -206,6 +206,27 @@ def test_command_estimates_parts_and_writes_them(
     assert "evaluation 1:" in shown
 
 
+@pytest.mark.slow
+def test_command_predicts_a_pose_that_was_held_out(monkeypatch, tmp_path, capsys, bar, bar_problem):
+    """A soft bar, fitted on a bend: its twist is predicted, and ARAP's is another."""
+    names = [tmp_path / f"{name}.ply" for name in ("rest", "bend", "twist")]
+    points = bar.vertices[bar_problem.handles]
+    jd.save_mesh(names[0], bar)
+    for name, targets in zip(
+        names[1:], (jd.bend(points, 60.0), jd.twist(points, 60.0)), strict=True
+    ):
+        pose = jd.deform(bar_problem, targets, 0.3).vertices
+        jd.save_mesh(name, bar, vertices=pose)
+    options = ["--hold-out", 1, "-o", tmp_path / "out.ply"]
+    assert run_cli(monkeypatch, "estimate", *names, *options) == 0
+    shown = capsys.readouterr().out
+    (line,) = [line for line in shown.splitlines() if "twist.ply" in line]
+    ours, arap = (float(word) for word in line.replace("\u2502", " ").split()[1:3])
+    assert ours < 0.01 < arap
+    assert run_cli(monkeypatch, "estimate", *names, "--hold-out", 2, "-o", tmp_path / "o.ply") == 2
+    assert "--hold-out 2 leaves none of the 2 poses" in capsys.readouterr().err
+
+
 def test_command_refuses_what_does_not_fit(monkeypatch, tmp_path, capsys, bar):
     rest, other, out = (tmp_path / name for name in ("rest.ply", "other.ply", "out.ply"))
     jd.save_mesh(rest, bar)

@@ -1,0 +1,101 @@
+"""The prior of a smooth field: differences of log rigidity along the edges cost something."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float, Int
+
+from jaxdeform._deformation.problem import Problem
+from jaxdeform._linalg.cholesky import Factor, factorise
+from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian, lifted_weights
+
+# Conjugate gradients of one Gauss-Newton step, which need not be exact.
+_CG_TOLERANCE, _CG_STEPS = 1e-2, 60
+# Vertices whose variances are solved for together.
+_TOGETHER = 256
+# Constants cost nothing under the Laplacian; where it must be inverted, they cost a little.
+_SHIFT = 1e-2
+
+
+class Prior(NamedTuple):
+    """The cotangent Laplacian L of log rigidity t, as a sum over the edges.
+
+    ``t^T L t`` is the integral of |grad t|^2 over the surface: a pure number.
+    """
+
+    root: Float[Array, "edges"]
+    """Square roots of the edge weights."""
+    edges: Int[Array, "edges 2"]
+    n_vertices: int
+    factor: Factor
+    """Of L, made definite: the preconditioner."""
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Prior":
+        """Set up the prior of a problem's mesh."""
+        mesh = problem.mesh
+        # Negative weights would reward differences.
+        weights = lifted_weights(cotangent_weights(mesh))
+        laplacian = graph_laplacian(mesh.edges, weights, mesh.n_vertices)
+        shifted = laplacian + _SHIFT * sp.identity(mesh.n_vertices)
+        everywhere = np.ones(mesh.n_vertices, bool)
+        factor = factorise(shifted.tocsr(), everywhere, problem.dtype, positions=mesh.vertices)
+        root = jnp.asarray(np.sqrt(weights), problem.dtype)
+        return cls(root, jnp.asarray(mesh.edges, jnp.int32), mesh.n_vertices, factor)
+
+    def differences(self, theta: Float[Array, "vertices"]) -> Float[Array, "edges"]:
+        """Return weighted differences: the sum of their squares is the prior."""
+        return self.root * (theta[self.edges[:, 0]] - theta[self.edges[:, 1]])
+
+    def product(
+        self, vectors: Float[Array, "vertices columns"]
+    ) -> Float[Array, "vertices columns"]:
+        """Return L, made definite, times vectors."""
+        i, j = self.edges.T
+        flow = (self.root**2)[:, None] * (vectors[i] - vectors[j])
+        return (_SHIFT * vectors).at[i].add(flow).at[j].add(-flow)
+
+    def variances(self) -> Float[np.ndarray, "vertices"]:
+        """Return the diagonal of the inverse of L, made definite: one solve for each vertex."""
+        n = self.n_vertices
+        found = np.empty(n)
+        for first in range(0, n, _TOGETHER):
+            at = np.arange(first, first + _TOGETHER)
+            unit = (np.arange(n) == at[:, None]).astype(self.root.dtype)
+            inside = at[at < n]
+            found[inside] = np.asarray(self.factor.solve(jnp.asarray(unit)))[inside - first, inside]
+        return found
+
+
+class WithPrior(eqx.Module):
+    """The derivative of the residual with the prior below it."""
+
+    data: lx.FunctionLinearOperator
+    prior: Prior
+    weight: Float[Array, ""]
+
+    def mv(self, vector):
+        """Return the product with a change of log rigidity."""
+        return self.data.mv(vector), jnp.sqrt(self.weight) * self.prior.differences(vector)
+
+
+class Solve(eqx.Module):
+    """Solves for the Gauss-Newton step by conjugate gradients, preconditioned with the prior."""
+
+    factor: Factor
+    weight: Float[Array, ""]
+
+    def __call__(self, jacobian: lx.AbstractLinearOperator, residual) -> Float[Array, "vertices"]:
+        """Return the step."""
+        transposed = jacobian.transpose()
+        product = lambda x: transposed.mv(jacobian.mv(x))  # noqa: E731
+        precondition = lambda r: self.factor.solve(r) / self.weight  # noqa: E731
+        right = -transposed.mv(residual)
+        return jax.scipy.sparse.linalg.cg(
+            product, right, tol=_CG_TOLERANCE, maxiter=_CG_STEPS, M=precondition
+        )[0]
