@@ -140,7 +140,9 @@ def estimate_rigidity_field(
         check_tolerance("smoothness", smoothness, positive=True)
     check_count("max_evaluations", max_evaluations)
     check_function("progress", progress, "evaluation, misfit, rigidity")
-    adjoint = choose_adjoint(solver, adjoint or (None if solver.can_unroll else _ADJOINT))
+    if adjoint is None and isinstance(solver, QuasiNewton):
+        adjoint = _ADJOINT
+    adjoint = choose_adjoint(solver, adjoint)
     poses = check_poses(problem, observed, targets, mask)
     size = _sizes(problem)
     medium = np.full(len(size), 0.1 * np.median(size))
