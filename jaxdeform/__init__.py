@@ -14,7 +14,6 @@ from jaxdeform._baselines.skinning import (
 )
 from jaxdeform._baselines.skinning_weights import (
     bounded_biharmonic_weights,
-    geodesic_distances,
     inverse_distance_weights,
     rigid_weights,
 )
@@ -45,6 +44,7 @@ from jaxdeform._handles.targets import bend, rotate, translate, twist
 from jaxdeform._mesh import shapes
 from jaxdeform._mesh.cells import Cells, rings, spokes
 from jaxdeform._mesh.files import load_mesh, load_rigidity, save_mesh
+from jaxdeform._mesh.geodesics import geodesic_distances
 from jaxdeform._mesh.inspection import Inspection, inspect, repair
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh
