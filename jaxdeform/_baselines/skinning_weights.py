@@ -8,7 +8,6 @@ from jaxtyping import Array, Float
 
 from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import (
-    check_handles,
     check_labels,
     check_positions,
     check_type,
@@ -17,6 +16,7 @@ from jaxdeform._checks import (
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._handles.split import check_components
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.selection import check_handles
 
 
 def rigid_weights(
@@ -102,7 +102,7 @@ def bounded_biharmonic_weights(
     **Arguments**
 
     - mesh: the surface, closed or open.
-    - handles: (handles,), vertex indices.
+    - handles: (handles,), vertex indices, a mask or a selection.
     - group: (handles,), the control of each handle, numbered from 0; by default each handle is a
       control.
 
@@ -117,7 +117,7 @@ def bounded_biharmonic_weights(
         (722, 2)
     """
     check_type("mesh", mesh, Mesh)
-    index = check_handles(handles, mesh.n_vertices)
+    index = check_handles(handles, mesh)
     count = len(index)
     given = np.arange(count) if group is None else group
     group = check_labels("group", given, count, "handle", count)

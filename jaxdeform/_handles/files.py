@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxdeform._checks import check_handles, check_type, read_path
+from jaxdeform._checks import check_type, read_path
 from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.reading import read_json, read_text
+from jaxdeform._mesh.selection import check_handles
 from jaxdeform._mesh.words import real
 
 
@@ -70,7 +71,7 @@ def load_handles(
     else:
         handles, targets = _parse_json(path, mesh)
     try:
-        handles = check_handles(handles, mesh.n_vertices)
+        handles = check_handles(handles, mesh)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return HandleFile(handles, targets)
@@ -88,7 +89,7 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
             raise InputError(f'{where} has no "vertices": list the vertex indices')
         _check_keys(where, group, "vertices", "rotation", "translation", "targets", "name")
         try:
-            index = check_handles(group["vertices"], mesh.n_vertices)
+            index = check_handles(group["vertices"], mesh)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
         handles.append(index)
