@@ -17,7 +17,7 @@ from rich.table import Table
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import make_folder, read_parts, read_pose
-from jaxdeform._apps.deforming import deform
+from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.results import as_json
 from jaxdeform._apps.talk import console, mouth, patiently, say_wrote, since
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
@@ -47,7 +47,7 @@ def compute_in_double_precision() -> None:
 
 
 def main() -> None:
-    """Run the command line. An InputError becomes one line on standard error and exit code 2."""
+    """Run the command line. An InputError becomes a line on standard error and exit code 2."""
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
         try:
@@ -60,6 +60,8 @@ def main() -> None:
         raise
     except jd.InputError as error:
         print(f"jaxdeform: {error}", file=sys.stderr)
+        for note in getattr(error, "__notes__", []):  # where an expression is wrong
+            print(note, file=sys.stderr)
         sys.exit(2)
     except OSError as error:  # typer's own texts, such as --help
         if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EIO):
@@ -133,7 +135,7 @@ def inspect(mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file
     console.print(str(jd.inspect(mesh)))
 
 
-app.command()(deform)
+app.command(cls=DeformCommand)(deform)
 
 
 @app.command()

@@ -261,6 +261,7 @@ def test_ctrl_c_leaves_old_files_whole(files):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None
+    assert process.stdout.readline().startswith("fixed: ")
     assert "precomputed" in process.stdout.readline()
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
