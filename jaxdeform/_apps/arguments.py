@@ -50,6 +50,30 @@ def read_parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
         raise jd.InputError(f"{path}: {error}") from error
 
 
+def choose_parts(path: Path | None, expressions: list[str], mesh: jd.Mesh) -> np.ndarray:
+    """Return the part of each vertex, from a file or by expressions; without either, 0."""
+    if path is None:
+        return parts_by_place(expressions, mesh)
+    if expressions:
+        raise jd.InputError("--part and --parts are two ways to name the parts: give one of them")
+    return read_parts(path, mesh)
+
+
+def parts_by_place(expressions: list[str], mesh: jd.Mesh) -> np.ndarray:
+    """Return the part of each vertex: 1 where the first expression holds, and so on; else 0."""
+    label = np.zeros(mesh.n_vertices, int)
+    for number, expression in enumerate(expressions, 1):
+        label[some_where(mesh, expression, "--part").mask] = number
+    for number, size in enumerate(np.bincount(label, minlength=len(expressions) + 1)):
+        if not size:
+            which = "what no --part names" if number == 0 else shown(expressions[number - 1])
+            raise jd.InputError(
+                f"--part: no vertex is left for part {number}, {which}: leave out an expression "
+                "that covers it"
+            )
+    return label
+
+
 def _number(word: str) -> int | str:
     """Return the integer, or the word if it is none."""
     return int(word) if re.fullmatch(r"[+-]?[0-9]{1,18}", word) else word

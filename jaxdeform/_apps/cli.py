@@ -16,7 +16,7 @@ import typer
 from rich.table import Table
 
 import jaxdeform as jd
-from jaxdeform._apps.arguments import make_folder, read_parts, read_pose
+from jaxdeform._apps.arguments import choose_parts, make_folder, read_pose
 from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.results import as_json
 from jaxdeform._apps.talk import console, mouth, patiently, say_wrote, since
@@ -150,6 +150,13 @@ def estimate(
         Path | None,
         typer.Option(help="The part of each vertex, from 0: one number per line, or .json."),
     ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EXPR",
+            help="Vertices of part 1; given again, of part 2, ... All others are part 0.",
+        ),
+    ] = None,
     tolerance: Annotated[
         float,
         typer.Option(
@@ -171,7 +178,7 @@ def estimate(
         raise jd.InputError(f"{out}: only PLY carries rigidity per vertex: use a .ply name")
     check_place(report)
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
-    label = np.zeros(shape.n_vertices, int) if parts is None else read_parts(parts, shape)
+    label = choose_parts(parts, part or [], shape)
     if handles is None:
         index = _moved_rigidly(shape, observed, tolerance)
     else:
