@@ -14,7 +14,6 @@ from jaxdeform._baselines.skinning import (
 )
 from jaxdeform._baselines.skinning_weights import (
     bounded_biharmonic_weights,
-    geodesic_distances,
     inverse_distance_weights,
     rigid_weights,
 )
@@ -42,12 +41,14 @@ from jaxdeform._estimation.verdict import Verdict
 from jaxdeform._handles.files import HandleFile, load_handles
 from jaxdeform._handles.rigid import rigid_targets
 from jaxdeform._handles.targets import bend, rotate, translate, twist
-from jaxdeform._mesh import shapes
+from jaxdeform._mesh import select, shapes
 from jaxdeform._mesh.cells import Cells, rings, spokes
 from jaxdeform._mesh.files import load_mesh, load_rigidity, save_mesh
+from jaxdeform._mesh.geodesics import geodesic_distances
 from jaxdeform._mesh.inspection import Inspection, inspect, repair
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.selection import Selection
 from jaxdeform._mesh.submesh import Submesh, submesh
 from jaxdeform._plotting import render
 from jaxdeform._result import Result
@@ -77,6 +78,7 @@ __all__ = [
     "Result",
     "RigidGroup",
     "RotationFit",
+    "Selection",
     "Skeleton",
     "Solution",
     "Solver",
@@ -116,6 +118,7 @@ __all__ = [
     "rings",
     "rotate",
     "save_mesh",
+    "select",
     "shapes",
     "spokes",
     "submesh",

@@ -74,9 +74,8 @@ def read_integers(
     """Return whole numbers, of any sign, or raise InputError. An empty list is whole."""
     given = read_numbers(value, name)
     if given.size and given.dtype.kind not in "iu":
-        mask = ", of a mask by np.flatnonzero(mask)" if given.dtype == bool else ""
         whole = "integers" if given.ndim else "an integer"
-        raise InputError(f"{name} must be {whole}, got {given.dtype}: {hint}{mask}")
+        raise InputError(f"{name} must be {whole}, got {given.dtype}: {hint}")
     if given.size and given.dtype.kind == "u" and given.max() > np.iinfo(np.int64).max:
         raise InputError(f"{name}: {given.max()} is too large for an index: {hint}")
     return given.astype(np.int64)

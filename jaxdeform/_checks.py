@@ -191,23 +191,22 @@ def check_index(
         )
 
 
-def check_handles(
-    handles: ArrayLike, n: int, *, name: str = "handle"
-) -> Int[np.ndarray, "handles"]:
-    """Return the handle indices as an array, or raise InputError naming what is wrong."""
-    given = read_integers(handles, f"{name}s")
-    if given.ndim != 1:
-        raise InputError(f"{name}s have shape {given.shape}: give one list of vertex indices")
-    if given.size == 0:
-        raise InputError(f"no {name}s: without one the mesh could lie anywhere; give at least one")
-    check_index(name, given, n)
-    unique, count = np.unique(given, return_counts=True)
-    if (count > 1).any():
+def read_axis(name: str, axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
+    """Return a unit vector from 'x', 'y', 'z' or a vector of any length, or raise InputError."""
+    if isinstance(axis, str):
+        if axis not in ("x", "y", "z"):
+            raise InputError(
+                f"{name} is {shown(axis)}: give 'x', 'y', 'z' or a vector of three numbers"
+            )
+        return np.eye(3)["xyz".index(axis)]
+    vector = read_host_array(axis, np.float64, name)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
         raise InputError(
-            f"vertex {unique[count > 1][0]} is a {name} {count.max()} times: list it once, because "
-            "it can have only one target"
+            f"{name} is {shown(axis)}: give 'x', 'y', 'z' or a vector (3,) that is not zero"
         )
-    return given
+    # Scaled first: squares of 1e-200 vanish, those of 1e308 overflow.
+    vector = np.ldexp(vector, -int(np.frexp(np.abs(vector).max())[1]))
+    return vector / np.linalg.norm(vector)
 
 
 def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:

@@ -16,7 +16,8 @@ class InputError(ValueError):
     """Wrong input: names the vertex, face, file or argument, the reason, and the next move.
 
     The text is one line of bounded length. Control characters, which may come from a file, are
-    shown as escapes, so that they never reach a terminal.
+    shown as escapes, so that they never reach a terminal. For a wrong expression a note
+    (``__notes__``, which Python prints below the text) shows the place by a caret.
     """
 
     def __init__(self, text: str = "") -> None:

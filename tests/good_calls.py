@@ -188,6 +188,27 @@ def good_calls(folder: Path) -> dict:
             jd.save_mesh,
             {"path": ply, "mesh": MESH, "vertices": MESH.vertices, "rigidity": np.ones(N)},
         ),
+        "select.border": (jd.select.border, {"mesh": MESH}),
+        "select.box": (jd.select.box, {"mesh": MESH, "low": [0, 0, 0], "high": [1, 1, 1]}),
+        "select.component": (jd.select.component, {"mesh": MESH, "vertices": [0]}),
+        "select.halfspace": (
+            jd.select.halfspace,
+            {"mesh": MESH, "axis": "y", "above": 0.1, "below": [0.0, 2.0, 0.0]},
+        ),
+        "select.mask": (jd.select.mask, {"mesh": MESH, "mask": np.ones(N, bool)}),
+        "select.nearest": (
+            jd.select.nearest,
+            {"mesh": MESH, "point": [0.0, 1.0, 0.0], "count": 2},
+        ),
+        "select.sphere": (
+            jd.select.sphere,
+            {"mesh": MESH, "center": [0.0, 1.0, 0.0], "radius": 1.0},
+        ),
+        "select.where": (jd.select.where, {"mesh": MESH, "expression": "y > 0.1"}),
+        "select.within": (
+            jd.select.within,
+            {"mesh": MESH, "sources": [0, 1], "distance": 1.0},
+        ),
         "spokes": (jd.spokes, {"mesh": MESH, "weights": np.ones(EDGES)}),
         "submesh": (jd.submesh, {"mesh": MESH, "free": [4], "cells": CELLS}),
         "translate": (jd.translate, {"points": MESH.vertices, "offset": [1.0, 2.0, 3.0]}),
@@ -196,12 +217,14 @@ def good_calls(folder: Path) -> dict:
 
 
 OF_KIND = {
-    "numbers": "base center centers constant controls deformed degrees distances edge_weights "
-    "handle_weights observed offset points power rest rigidity rotations start targets transforms "
-    "translations vertices weights",
-    "indices": "faces free group handles parts r sources",
-    "count": "history_length max_evaluations max_steps steps width",
-    "tolerance": "determined_within smoothness step_size target_noise threshold tolerance",
+    "numbers": "above base below center centers constant controls deformed degrees distances "
+    "edge_weights handle_weights high low observed offset point points power rest rigidity "
+    "rotations start targets transforms translations vertices weights",
+    "indices": "faces group parts r",
+    "vertices": "free handles sources",
+    "count": "count history_length max_evaluations max_steps steps width",
+    "tolerance": "determined_within distance radius smoothness step_size target_noise threshold "
+    "tolerance",
     "path": "path motion",
     "setting": "adjoint local solver",
     "flag": "normals similarity throw",
@@ -212,6 +235,7 @@ KINDS = {name: kind for kind, names in OF_KIND.items() for name in names.split()
 KINDS_HERE = {
     ("estimate_rigidity_thesis", "start"): "tolerance",
     ("inspect", "mesh"): "mesh-like",
+    ("select.component", "vertices"): "vertices",
     ("repair", "mesh"): "mesh-like",
 }
 

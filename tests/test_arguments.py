@@ -34,7 +34,8 @@ NOT_CALLED = {
         "InputError",
         "Inspection",
     ),
-    *("LocalStep", "Problem", "Result", "RigidGroup", "Skeleton", "Solution", "Solver"),
+    *("LocalStep", "Problem", "Result", "RigidGroup", "Selection", "Skeleton", "Solution"),
+    "Solver",
     "ThesisEstimate",
     "Verdict",
 }
@@ -121,6 +122,21 @@ def wrong_numbers(good, problem) -> dict:
     return no_arrays(problem) | spoilt(good) | shapes | {"nan": nan, "jax nan": jnp.asarray(nan)}
 
 
+def wrong_vertices(good, problem) -> dict:
+    """Return what chooses no vertices: no indices, no mask, no selection of this mesh."""
+    other = jd.shapes.square()
+    return wrong_indices(good, problem) | {
+        "short mask": np.ones(3, bool),
+        "jax short mask": jnp.ones(3, bool),
+        "one truth": True,
+        "mask of poses": np.ones((2, N), bool),
+        "empty mask": np.zeros(N, bool),
+        "none": [],
+        "selection of another mesh": jd.select.border(other),
+        "empty selection": jd.select.where(MESH, "x > 9"),
+    }
+
+
 def wrong_indices(good, problem) -> dict:
     good = np.asarray(good)
     return no_arrays(problem) | {
@@ -192,6 +208,12 @@ def wrong_values(kind: str, good, problem) -> dict:
     table = {
         "numbers": lambda: wrong_numbers(good, problem),
         "indices": lambda: wrong_indices(good, problem),
+        "vertices": lambda: wrong_vertices(good, problem),
+        "expression": lambda: (
+            NO_SETTING
+            | {"none": None, "number": 3, "texts": ["y < 1"], "empty": "", "number as text": "3"}
+            | {"code": "__import__('os')", "no sign": "y 1", "deep": "(" * 9999, "NUL": "y\0< 1"}
+        ),
         "mask": lambda: (
             no_arrays(problem)
             | {
@@ -256,6 +278,8 @@ class Unhashable(jd.QuasiNewton, jd.Newton, jd.Implicit):
 # Values that an argument may take, though their kind may not.
 ALLOWED = {
     ("load_handles", "motion"): {"none"},
+    ("select.mask", "mask"): {"nothing seen"},  # a selection may be empty
+    ("select.within", "sources"): {"repeated"},
     ("rings", "r"): {"too large for memory", "largest"},  # cells reach as far as the mesh
 }
 
@@ -264,7 +288,7 @@ FUNCTIONS = {
     name
     for name in jd.__all__
     if callable(getattr(jd, name)) and name not in NOT_CALLED | NO_ARGUMENTS
-}
+} | {f"select.{name}" for name in jd.select.__all__}
 
 
 def test_every_function_and_argument_is_in_the_table(calls):
@@ -320,8 +344,11 @@ def test_another_type_is_told_what_makes_the_right_one(calls):
         "adjoint is a QuasiNewton, without solve: give jd.Implicit": lambda: jd.deform(
             problem, TARGETS, 1.0, adjoint=jd.QuasiNewton()
         ),
-        r"handles must be integers, got bool.*np.flatnonzero": lambda: jd.precompute(
-            MESH, np.ones(N, bool)
+        r"handles: the mask has shape \(3,\): give \(7,\), one boolean per vertex": lambda: (
+            jd.precompute(MESH, np.ones(3, bool))
+        ),
+        r"handles must be integers, got float64: give vertex indices, a mask": lambda: (
+            jd.precompute(MESH, [0.5])
         ),
         "handles cannot be read as numbers: it holds 1180591620717411303424": lambda: jd.precompute(
             MESH, [2**70, 0]

@@ -66,9 +66,13 @@ def test_imports_run_in_no_circle():
     list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
 
 
-@pytest.mark.parametrize("name", sorted(jd.__all__))
+PUBLIC = {name: getattr(jd, name) for name in jd.__all__}
+PUBLIC |= {f"select.{name}": getattr(jd.select, name) for name in jd.select.__all__}
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
 def test_every_public_name_is_explained(name):
-    thing = getattr(jd, name)
+    thing = PUBLIC[name]
     text = inspect.getdoc(thing)
     assert text, f"{name} has no docstring"
     if inspect.isfunction(thing):
@@ -101,7 +105,7 @@ def test_no_module_leaks_into_the_public_face():
         for name, thing in vars(jd).items()
         if inspect.ismodule(thing) and thing.__name__.startswith("jaxdeform")
     }
-    assert {name for name in ours if not name.startswith("_")} == {"shapes"}
+    assert {name for name in ours if not name.startswith("_")} == {"select", "shapes"}
 
 
 def code_lines(node: ast.FunctionDef, text: str) -> int:

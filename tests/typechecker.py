@@ -12,6 +12,8 @@ PUBLIC = next(
     if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
 )
 PUBLIC |= {"bar", "cactus", "cylinder", "octopus", "square"}  # jd.shapes
+PUBLIC |= {"border", "box", "component", "halfspace", "mask", "nearest", "sphere"}  # jd.select
+PUBLIC |= {"where", "within"}
 SETTINGS = {"Alternating", "GradientDescent", "Implicit", "LBFGS", "Newton", "QuasiNewton"}
 PUBLIC |= {f"{name}.__init__" for name in {"Mesh", *SETTINGS}}
 

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,7 +11,11 @@ from jaxdeform._checks import check_rigidity
 from jaxdeform._errors import shown
 from jaxdeform._estimation.parts import check_parts
 from jaxdeform._mesh.reading import read_json, read_text
+from jaxdeform._mesh.select import some_where
 from jaxdeform._mesh.words import real
+
+MEDIUM = 0.2
+"""A material between rubber and steel, for :func:`jaxdeform.rigidity_from_material`."""
 
 
 def read_pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:
@@ -45,6 +50,30 @@ def read_parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
         raise jd.InputError(f"{path}: {error}") from error
 
 
+def choose_parts(path: Path | None, expressions: list[str], mesh: jd.Mesh) -> np.ndarray:
+    """Return the part of each vertex, from a file or by expressions; without either, 0."""
+    if path is None:
+        return parts_by_place(expressions, mesh)
+    if expressions:
+        raise jd.InputError("--part and --parts are two ways to name the parts: give one of them")
+    return read_parts(path, mesh)
+
+
+def parts_by_place(expressions: list[str], mesh: jd.Mesh) -> np.ndarray:
+    """Return the part of each vertex: 1 where the first expression holds, and so on; else 0."""
+    label = np.zeros(mesh.n_vertices, int)
+    for number, expression in enumerate(expressions, 1):
+        label[some_where(mesh, expression, "--part").mask] = number
+    for number, size in enumerate(np.bincount(label, minlength=len(expressions) + 1)):
+        if not size:
+            which = "what no --part names" if number == 0 else shown(expressions[number - 1])
+            raise jd.InputError(
+                f"--part: no vertex is left for part {number}, {which}: leave out an expression "
+                "that covers it"
+            )
+    return label
+
+
 def _number(word: str) -> int | str:
     """Return the integer, or the word if it is none."""
     return int(word) if re.fullmatch(r"[+-]?[0-9]{1,18}", word) else word
@@ -73,3 +102,46 @@ def make_folder(folder: Path) -> None:
         raise jd.InputError(
             f"{folder}: cannot be made ({error.strerror}): choose another folder"
         ) from error
+
+
+class Material(NamedTuple):
+    """The rigidity that the options give."""
+
+    base: np.ndarray | None
+    """One number, or one per vertex; None for a medium material."""
+    regions: list[tuple[jd.Selection, float]]
+    """Where it is another number. A later one wins."""
+
+    @property
+    def varies(self) -> bool:
+        """Whether there is something to see in colours."""
+        return bool(self.regions) or (self.base is not None and self.base.ndim > 0)
+
+    def at(self, problem: jd.Problem) -> np.ndarray:
+        """Return the rigidity of each vertex."""
+        base = jd.rigidity_from_material(problem, MEDIUM) if self.base is None else self.base
+        values = np.broadcast_to(np.asarray(base), (problem.n_vertices,)).copy()
+        for chosen, value in self.regions:
+            values[chosen.mask] = value
+        return values
+
+
+def read_material(mesh: jd.Mesh, rigidity: str | None, regions: list[str]) -> Material:
+    """Return the rigidity from ``--rigidity`` and from each ``--stiff``, "EXPR: VALUE"."""
+    base = None if rigidity is None else read_rigidity(rigidity, mesh)
+    found = []
+    for region in regions:
+        expression, _, word = region.rpartition(":")
+        try:
+            value = np.asarray(real(word.encode(errors="replace")))
+        except ValueError:
+            raise jd.InputError(
+                f"--stiff: {shown(word.strip())} is not a number: give --stiff EXPR VALUE, such as "
+                '--stiff "y > 0.5" 30'
+            ) from None
+        try:
+            check_rigidity(value, mesh.n_vertices, value.dtype)
+        except jd.InputError as error:
+            raise jd.InputError(f"--stiff: {error}") from error
+        found.append((some_where(mesh, expression, "--stiff"), float(value)))
+    return Material(base, found)

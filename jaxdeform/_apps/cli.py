@@ -5,25 +5,21 @@ import json
 import os
 import signal
 import sys
-import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TextIO, TypeVar, cast
+from typing import Annotated
 
 import jax
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import jaxdeform as jd
-from jaxdeform._apps.arguments import make_folder, read_parts, read_pose, read_rigidity
-from jaxdeform._apps.mouth import Mouth
-from jaxdeform._apps.results import as_json, save_result
+from jaxdeform._apps.arguments import choose_parts, make_folder, read_pose
+from jaxdeform._apps.deforming import DeformCommand, deform
+from jaxdeform._apps.results import as_json
+from jaxdeform._apps.talk import console, mouth, patiently, say_wrote, since
 from jaxdeform._errors import printable
 from jaxdeform._estimation.held_out import prediction_errors
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
@@ -36,11 +32,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-# Print file names unchanged: brackets are not markup, and lines are not wrapped.
-mouth = Mouth()
-console = Console(file=cast(TextIO, mouth), highlight=False, markup=False, soft_wrap=True)
-
-Out = TypeVar("Out")
 
 
 class _Interrupted(BaseException):
@@ -58,7 +49,7 @@ def compute_in_double_precision() -> None:
 
 
 def main() -> None:
-    """Run the command line. An InputError becomes one line on standard error and exit code 2."""
+    """Run the command line. An InputError becomes a line on standard error and exit code 2."""
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
         try:
@@ -71,6 +62,8 @@ def main() -> None:
         raise
     except jd.InputError as error:
         print(f"jaxdeform: {error}", file=sys.stderr)
+        for note in getattr(error, "__notes__", []):  # where an expression is wrong
+            print(note, file=sys.stderr)
         sys.exit(2)
     except OSError as error:  # typer's own texts, such as --help
         if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EIO):
@@ -93,28 +86,6 @@ def _tell_failure() -> None:
         sys.exit(1)
 
 
-def _patiently(what: str, work: Callable[[], Out]) -> Out:
-    """Run work in another thread and show how long it takes.
-
-    While JAX computes, its thread does not receive Ctrl-C; the main thread, which waits, does.
-    """
-    outcome: Future[Out] = Future()
-
-    def run() -> None:
-        try:
-            outcome.set_result(work())
-        except BaseException as error:
-            outcome.set_exception(error)
-
-    columns = SpinnerColumn(), TextColumn(what, markup=False), TimeElapsedColumn()
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        bar.add_task(what, total=None)
-        threading.Thread(target=run, daemon=True).start()
-        return outcome.result()
-
-
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("out"),
@@ -127,7 +98,7 @@ def demo(
     handles = np.flatnonzero((y < 6) | (y > 145))
     began = time.perf_counter()
     problem = jd.precompute(mesh, handles)
-    console.print(f"{mesh}, {len(handles)} handles: precomputed in {_since(began)}")
+    console.print(f"{mesh}, {len(handles)} handles: precomputed in {since(began)}")
     targets = jd.bend(mesh.vertices[handles], 90.0)
     materials = {
         "soft": np.full(mesh.n_vertices, 0.01),
@@ -139,12 +110,12 @@ def demo(
     for name, rigidity in materials.items():
         began = time.perf_counter()
         bend = partial(jd.deform, problem, targets, rigidity)
-        solution = _patiently(f"bending the {name} bar", bend)
+        solution = patiently(f"bending the {name} bar", bend)
         table.add_row(
             name,
             f"{float(solution.energy[-1]):.4g}",
             str(int(solution.steps)),
-            _since(began),
+            since(began),
             jd.Result[solution.result],
         )
         poses.append(np.asarray(solution.vertices))
@@ -166,67 +137,7 @@ def inspect(mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file
     console.print(str(jd.inspect(mesh)))
 
 
-@app.command()
-def deform(
-    mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Mesh file to write.")],
-    handles: Annotated[
-        Path, typer.Option(help="Handle file: .json, or .sel with a .def of the same name.")
-    ],
-    rigidity: Annotated[
-        str, typer.Option(help="A number, or a PLY file with one rigidity per vertex.")
-    ],
-    rings: Annotated[int, typer.Option(min=1, help="Size of the cells, in rings of vertices.")] = 1,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Number of alternating steps. By default, until convergence (100 with --normals).",
-        ),
-    ] = None,
-    normals: Annotated[bool, typer.Option(help="Add the normal term (Eq. 4.7).")] = False,
-    motion: Annotated[
-        Path | None, typer.Option(help="The .def file of a .sel handle file.")
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG file for a picture of both shapes.")
-    ] = None,
-) -> None:
-    """Move the handles of a mesh; the rest of it follows."""
-    shape = jd.load_mesh(mesh)
-    # Check all arguments before the long work.
-    check_output(out, shape)
-    if picture is not None:
-        check_picture_path(picture)
-    moves = jd.load_handles(handles, shape, motion)
-    values = read_rigidity(rigidity, shape)
-    began = time.perf_counter()
-    problem = _patiently(
-        "precomputing", lambda: jd.precompute(shape, moves.handles, cells=jd.rings(shape, rings))
-    )
-    console.print(f"{shape}, {len(moves.handles)} handles: precomputed in {_since(began)}")
-    began = time.perf_counter()
-    solver = None if steps is None else jd.Alternating(steps)
-    solution = _patiently(
-        "deforming",
-        lambda: jd.deform(problem, moves.targets, values, solver=solver, normals=normals),
-    )
-    # The result first, then words about it: whatever happens to those, the work is kept.
-    color = values if format_of(out) == ".ply" else None
-    save_result(out, shape, np.asarray(solution.vertices), color)
-    energy, done = float(solution.energy[-1]), int(solution.steps)
-    console.print(f"energy {energy:.6g} after {done} steps in {_since(began)}")
-    console.print(jd.Result[solution.result])
-    _say_wrote(out)
-    if picture is not None:
-        poses = [shape.vertices, np.asarray(solution.vertices)]
-        colors = [None, values] if values.ndim else []
-        jd.render(picture, shape, poses, titles=["rest", "deformed"], values=colors)
-        _say_wrote(picture)
-
-
-def _say_wrote(*names: Path) -> None:
-    console.print(f"wrote {printable(' and '.join(map(str, names)))}")
+app.command(cls=DeformCommand)(deform)
 
 
 @app.command()
@@ -240,6 +151,13 @@ def estimate(
     parts: Annotated[
         Path | None,
         typer.Option(help="The part of each vertex, from 0: one number per line, or .json."),
+    ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EXPR",
+            help="Vertices of part 1; given again, of part 2, ... All others are part 0.",
+        ),
     ] = None,
     tolerance: Annotated[
         float,
@@ -274,18 +192,18 @@ def estimate(
         raise jd.InputError(f"{out}: only PLY carries rigidity per vertex: use a .ply name")
     check_place(report)
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
-    label = np.zeros(shape.n_vertices, int) if parts is None else read_parts(parts, shape)
+    label = choose_parts(parts, part or [], shape)
     if handles is None:
         index = _moved_rigidly(shape, observed, tolerance)
     else:
         index = jd.load_handles(handles, shape).handles
     began = time.perf_counter()
-    problem = _patiently(
+    problem = patiently(
         "precomputing", lambda: jd.precompute(shape, index, cells=jd.rings(shape, rings))
     )
     solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
     fitted, kept = np.split(observed, [len(poses) - hold_out])
-    fit = _patiently(
+    fit = patiently(
         "estimating",
         lambda: jd.estimate_rigidity(
             problem, fitted, parts=label, solver=solver, progress=_show_evaluation
@@ -295,10 +213,10 @@ def estimate(
     text = json.dumps(as_json(fit, index), indent=1, allow_nan=False)
     write_atomically(report, f"{text}\n".encode())
     console.print(fit.explain())
-    console.print(f"estimated in {_since(began)}")
+    console.print(f"estimated in {since(began)}")
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
-    _say_wrote(out, report)
+    say_wrote(out, report)
 
 
 def _report_held_out(
@@ -306,7 +224,7 @@ def _report_held_out(
 ) -> None:
     """Predict poses that were not fitted, by the estimate and by ARAP."""
     table = Table("held out", "error, % of the diagonal", "ARAP")
-    ours, arap = _patiently(
+    ours, arap = patiently(
         "predicting",
         lambda: (
             prediction_errors(problem, observed, field, jd.Newton()),
@@ -329,7 +247,3 @@ def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.
 def _show_evaluation(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
     values = ", ".join(f"{value:.3g}" for value in rigidity[:5])
     console.print(f"evaluation {evaluation}: misfit {misfit:.4g}, rigidity {values}")
-
-
-def _since(began: float) -> str:
-    return f"{time.perf_counter() - began:.2f} s"

@@ -66,7 +66,7 @@ def laplacian_editor(
     **Arguments**
 
     - mesh: the rest shape.
-    - handles: (handles,), vertex indices.
+    - handles: (handles,), vertex indices, a mask or a selection.
     - weights: (edges,), in the order of ``mesh.edges``; by default cotangent weights. ``np.ones``
       gives the uniform Laplacian.
     - handle_weights: a number or (handles,). The default, infinity, keeps the handle on its target.
@@ -136,7 +136,7 @@ def laplacian_editing(
     **Arguments**
 
     - mesh: the rest shape.
-    - handles: (handles,), vertex indices.
+    - handles: (handles,), vertex indices, a mask or a selection.
     - targets: (handles, 3), in the unit of the mesh.
     - weights, handle_weights, similarity: as in :func:`laplacian_editor`.
 

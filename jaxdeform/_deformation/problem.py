@@ -114,7 +114,8 @@ def precompute(
     **Arguments**
 
     - mesh: the rest shape.
-    - handles: (handles,) vertex indices, each once.
+    - handles: (handles,) vertex indices, each once, or a mask (vertices,), or a selection of
+      ``jd.select``. Rows of targets are in their order; that of masks and selections is ascending.
     - cells: ``rings(mesh, r)`` or ``spokes(mesh)``; by default ``rings(mesh, 1)``.
     - handle_weights: a number or (handles,). With the default, infinity, a handle sits on its
       target. A finite weight w >= 0 pulls with ``w |p' - target|^2`` instead; its unit is that of
@@ -131,8 +132,7 @@ def precompute(
     Example:
         >>> import jaxdeform as jd
         >>> mesh = jd.shapes.bar()
-        >>> y = mesh.vertices[:, 1]
-        >>> handles = ((y < 6) | (y > 145)).nonzero()[0]
+        >>> handles = jd.select.where(mesh, "y < 6 or y > 145")
         >>> jd.precompute(mesh, handles).n_vertices
         722
     """

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxdeform._arrays import read_numbers
 from jaxdeform._checks import check_count, check_function, check_labels, check_tolerance
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
@@ -27,6 +28,7 @@ from jaxdeform._estimation.poses import check_poses, same_length, without
 from jaxdeform._estimation.search import search
 from jaxdeform._estimation.smooth_modes import smooth_modes
 from jaxdeform._estimation.verdict import Verdict, in_words
+from jaxdeform._mesh.selection import Selection
 from jaxdeform._result import Result, succeeded
 
 # Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
@@ -147,13 +149,15 @@ def estimate_rigidity(
 
     - problem: the rest shape with its handles; :func:`find_handles` finds them if need be.
     - observed: (n, 3) or (poses, n, 3) positions.
-    - parts: (n,) the part of each vertex, 0 to p - 1; one part by default.
+    - parts: (n,) the part of each vertex, 0 to p - 1; one part by default. A mask or a selection
+      makes two: its vertices are part 1, all others part 0.
     - targets: (h, 3) or (poses, h, 3) where the handles were put; by default their observed
       positions.
     - target_noise: noise of the targets, as a multiple of that of the observed vertices. By
       default 0 for targets that were given, and 1 for observed ones. Measured targets given as
       exact make the intervals far too narrow: say 1 then.
-    - mask: (n,) or (poses, n), False where a vertex was not seen; its position is not read.
+    - mask: (n,) or (poses, n), False where a vertex was not seen; its position is not read. Or a
+      selection of the vertices that were seen.
     - start: first guess, a number or (parts,); a medium material by default.
     - solver, adjoint: as in :func:`deform`. Poses that were made by 100 steps of the thesis's
       iteration are no equilibria: fit those with ``Alternating(steps=100)``.
@@ -309,7 +313,9 @@ def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
 
 def check_parts(parts: ArrayLike, n: int) -> Int[np.ndarray, "vertices"]:
     """Return the part of each vertex, or raise InputError naming what is wrong."""
-    label = check_labels("parts", parts, n, "vertex", n)
+    given = parts.mask if isinstance(parts, Selection) else read_numbers(parts, "parts")
+    label = given.astype(int) if given.dtype == bool else given
+    label = check_labels("parts", label, n, "vertex", n)
     missing = np.setdiff1d(np.arange(label.max() + 1), label)
     if missing.size:
         raise InputError(

@@ -11,6 +11,7 @@ from jaxdeform._checks import check_rigidity, read_positions
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._errors import InputError
 from jaxdeform._estimation.resemblance import check_resemblance
+from jaxdeform._mesh.selection import Selection
 
 # Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.
@@ -102,11 +103,13 @@ def read_poses(
 
 
 def _check_mask(mask: Any, poses: int, n: int) -> Bool[np.ndarray, "poses vertices"]:
-    seen = np.ones((poses, n), bool) if mask is None else read_numbers(mask, "mask")
+    if mask is None:
+        mask = np.ones(n, bool)
+    seen = mask.mask if isinstance(mask, Selection) else read_numbers(mask, "mask")
     if seen.dtype != bool or seen.shape not in ((n,), (poses, n)):
         raise InputError(
             f"mask has shape {seen.shape} and type {seen.dtype}: give booleans ({n},) or "
-            f"({poses}, {n}), True where a vertex was seen"
+            f"({poses}, {n}), True where a vertex was seen, or a jd.Selection of this mesh"
         )
     return np.broadcast_to(seen, (poses, n))
 

@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxdeform._checks import check_handles, check_type, read_path
+from jaxdeform._checks import check_type, read_path
 from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.reading import read_json, read_text
+from jaxdeform._mesh.select import some_where
+from jaxdeform._mesh.selection import check_handles
 from jaxdeform._mesh.words import real
 
 
@@ -31,7 +33,9 @@ def load_handles(
 
     There are two formats:
 
-    - ``.json``: ``{"handles": [{"vertices": [0, 1], ...}, ...]}``. A group may have
+    - ``.json``: ``{"handles": [{"where": "y < 0.1"}, {"vertices": [0, 1], ...}, ...]}``. A group
+      names its vertices by an expression (see ``jd.select.where``), by their indices, or by a mask
+      of booleans. It may have
       ``"rotation": {"axis": [0, 1, 0], "degrees": 90, "center": [0, 0, 0]}`` (by default the centre
       is the centroid of the group), ``"translation": [1, 0, 0]``, or both, or instead
       ``"targets": [[x, y, z], ...]``. A group with none of them stays where it is.
@@ -52,9 +56,9 @@ def load_handles(
     Example:
         >>> import jaxdeform as jd, json, pathlib, tempfile
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "handles.json"
-        >>> _ = path.write_text(json.dumps({"handles": [{"vertices": [0, 1]}]}))
-        >>> jd.load_handles(path, jd.shapes.bar()).handles
-        array([0, 1])
+        >>> _ = path.write_text(json.dumps({"handles": [{"where": "y < 6"}]}))
+        >>> len(jd.load_handles(path, jd.shapes.bar()).handles)
+        73
     """
     path = read_path("path", path)
     check_type("mesh", mesh, Mesh)
@@ -70,7 +74,7 @@ def load_handles(
     else:
         handles, targets = _parse_json(path, mesh)
     try:
-        handles = check_handles(handles, mesh.n_vertices)
+        handles = check_handles(handles, mesh)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return HandleFile(handles, targets)
@@ -84,16 +88,26 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     handles, targets = [], []
     for number, group in enumerate(groups):
         where = f"{path}: group {number}"
-        if not isinstance(group, dict) or "vertices" not in group:
-            raise InputError(f'{where} has no "vertices": list the vertex indices')
-        _check_keys(where, group, "vertices", "rotation", "translation", "targets", "name")
-        try:
-            index = check_handles(group["vertices"], mesh.n_vertices)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
+        if not isinstance(group, dict) or ("vertices" in group) == ("where" in group):
+            raise InputError(
+                f'{where}: give either "vertices", a list of indices, or "where", an expression '
+                'such as "y < 0.1"'
+            )
+        known = "vertices", "where", "rotation", "translation", "targets", "name"
+        _check_keys(where, group, *known)
+        index = _chosen(where, group, mesh)
         handles.append(index)
         targets.append(_moved(where, group, mesh.vertices[index]))
     return np.concatenate(handles), np.concatenate(targets)
+
+
+def _chosen(where: str, group: dict, mesh: Mesh) -> Int[np.ndarray, "chosen"]:
+    if "where" in group:
+        return some_where(mesh, group["where"], f"{where}: where").vertices
+    try:
+        return check_handles(group["vertices"], mesh)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _check_keys(where: str, given: dict, *known: str) -> None:

@@ -16,6 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxdeform._arrays import float_type, read_array, read_host_array, read_numbers
+from jaxdeform._checks import read_axis
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._linalg.rotations import rotation_matrices
 
@@ -72,7 +73,7 @@ def rotate(
     if center is not None:
         center = _numbers(xp, "center", center, points.dtype, (3,))
     run = _rotate_compiled if xp is jnp else partial(_rotate, np)
-    return _run(run, points, _degrees(xp, degrees, points.dtype), _axis("axis", axis), center)
+    return _run(run, points, _degrees(xp, degrees, points.dtype), read_axis("axis", axis), center)
 
 
 def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLike = "y") -> Points:
@@ -94,7 +95,7 @@ def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLik
     """
     xp = _namespace(points, degrees)
     points = _points(xp, points)
-    axis = _axis("along", along)
+    axis = read_axis("along", along)
     run = _twist_compiled if xp is jnp else partial(_twist, np)
     return _run(run, points, _degrees(xp, degrees, points.dtype), axis)
 
@@ -125,7 +126,7 @@ def bend(
     """
     xp = _namespace(points, degrees)
     points = _points(xp, points)
-    up, side = _axis("along", along), _axis("toward", toward)
+    up, side = read_axis("along", along), read_axis("toward", toward)
     normal = np.cross(up, side)
     length = np.linalg.norm(normal)
     if length < 1e-9:
@@ -180,23 +181,6 @@ def _degrees(xp, degrees: ArrayLike, dtype):
             f"{_MOST_DEGREES:g}"
         )
     return array
-
-
-def _axis(name: str, axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
-    if isinstance(axis, str):
-        if axis not in ("x", "y", "z"):
-            raise InputError(
-                f"{name} is {shown(axis)}: give 'x', 'y', 'z' or a vector of three numbers"
-            )
-        return np.eye(3)["xyz".index(axis)]
-    vector = read_host_array(axis, np.float64, name)
-    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
-        raise InputError(
-            f"{name} is {shown(axis)}: give 'x', 'y', 'z' or a vector (3,) that is not zero"
-        )
-    # Scaled first: squares of 1e-200 vanish, those of 1e308 overflow.
-    vector = np.ldexp(vector, -int(np.frexp(np.abs(vector).max())[1]))
-    return vector / np.linalg.norm(vector)
 
 
 def _run(motion, points, *arguments) -> Points:

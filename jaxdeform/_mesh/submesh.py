@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxdeform._arrays import read_integers, read_numbers
-from jaxdeform._checks import check_index, check_type, read_host_positions
+from jaxdeform._checks import check_type, read_host_positions
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.selection import read_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     **Arguments**
 
     - mesh: the whole mesh.
-    - free: indices of the vertices that may move, or a mask (vertices,).
+    - free: the vertices that may move: indices, a mask (vertices,) or a selection.
     - cells: the cells of the whole mesh; by default ``rings(mesh, 1)``.
 
     **Returns** a :class:`Submesh`.
@@ -80,7 +80,9 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     check_type("cells", cells, Cells)
     if cells.mesh != mesh:
         raise InputError("cells are of another mesh: call rings(mesh, r) for this one")
-    is_free = _mask(free, mesh.n_vertices)
+    is_free = read_mask("free", free, mesh, "free vertex")
+    if not is_free.any():
+        raise InputError("no vertex is free, so nothing can deform: give at least one")
     # The vertices of each cell, including its centre.
     reach = cells.reach
     moving = np.asarray((reach @ is_free.astype(np.int32)) > 0).ravel()
@@ -107,21 +109,3 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     membership.eliminate_zeros()
     piece_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
     return Submesh(piece, piece_cells, np.flatnonzero(~is_free[index]), index, mesh)
-
-
-def _mask(free: ArrayLike, n: int) -> np.ndarray:
-    given = read_numbers(free, "free")
-    if given.dtype == bool:
-        if given.shape != (n,):
-            raise InputError(f"the mask of free vertices has shape {given.shape}: give ({n},)")
-        mask = given
-    else:
-        given = read_integers(free, "free", "give a list of vertex indices, or a mask of booleans")
-        if given.ndim != 1:
-            raise InputError(f"free has shape {given.shape}: give one list of vertex indices")
-        check_index("free vertex", given, n)
-        mask = np.zeros(n, bool)
-        mask[given] = True
-    if not mask.any():
-        raise InputError("no vertex is free, so nothing can deform: give at least one")
-    return mask

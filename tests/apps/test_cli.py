@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import jaxdeform as jd
-from jaxdeform._apps.arguments import read_pose
+from jaxdeform._apps.arguments import parts_by_place, read_pose
 from jaxdeform._apps.cli import main
 from jaxdeform._mesh.files import without_suffix
 
@@ -261,6 +261,7 @@ def test_ctrl_c_leaves_old_files_whole(files):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None
+    assert process.stdout.readline().startswith("fixed: ")
     assert "precomputed" in process.stdout.readline()
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
@@ -396,3 +397,37 @@ def test_bad_files_of_parts(run, files, bar):
                        "--parts", path)  # fmt: skip
     assert code == 2
     assert "parts.json: is not valid JSON (Exceeds the limit" in err
+
+
+def test_parts_by_expressions(run, files, bar):
+    y = bar.vertices[:, 1]
+    found = parts_by_place(["y > 50", "y > 100"], bar)
+    np.testing.assert_array_equal(found, np.where(y > 100, 2, np.where(y > 50, 1, 0)))
+    assert not parts_by_place([], bar).any()
+    two = "--part", "y < 50", "--part"
+    for message, words in {
+        "--part: 'y > 200' holds for no vertex: x runs from": ("--part", "y > 200"),
+        "--part: no vertex is left for part 0, what no --part names": (*two, "y >= 50"),
+        "--part: no vertex is left for part 1, 'y < 50'": (*two, "y < 60"),
+        "--part and --parts are two ways": ("--part", "y > 50", "--parts", files / "p.txt"),
+    }.items():
+        code, out, err = run(
+            "estimate", files / "bar.off", files / "bar.off", "-o", files / "o.ply", *words
+        )
+        assert (code, out) == (2, "")
+        assert err.startswith(f"jaxdeform: {message}")
+
+
+@pytest.mark.slow
+def test_estimate_by_expressions_and_by_files_is_the_same(run, files, bar):
+    bent = "--handles", files / "bend.json", "--rigidity", files / "rigidity.ply"
+    pose, label = files / "pose.ply", (bar.vertices[:, 1] > 75.5).astype(int)
+    run("deform", files / "bar.off", *bent, "-o", pose)
+    (files / "p.txt").write_text(" ".join(map(str, label)))
+    found = []
+    for words in (("--parts", files / "p.txt"), ("--part", "y > 75.5")):
+        code, _, err = run("estimate", files / "bar.off", pose, "-o", files / "fit.ply", *words)
+        assert (code, err) == (0, "")
+        found.append(jd.load_rigidity(files / "fit.ply"))
+    np.testing.assert_array_equal(*found)
+    np.testing.assert_allclose(found[0], np.where(label, 30.0, 0.01), rtol=0.05)

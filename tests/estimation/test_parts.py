@@ -9,6 +9,8 @@ from helpers import THESIS, noisy
 
 import jaxdeform as jd
 from jaxdeform._apps import cli
+from jaxdeform._estimation.parts import check_parts
+from jaxdeform._estimation.poses import check_poses
 
 # ---------------------------------------------------------------- recovery
 
@@ -257,3 +259,19 @@ def test_command_refuses_what_does_not_fit(monkeypatch, tmp_path, capsys, bar):
         assert message in told
         assert told.count("\n") == 1
     assert out.read_text() == "kept"
+
+
+def test_selections_and_masks_stand_for_parts_and_for_what_was_seen(bar, bar_problem, halves):
+    upper = jd.select.mask(bar, halves == 1)
+    for parts in (upper, halves == 1, (halves == 1).tolist()):
+        np.testing.assert_array_equal(check_parts(parts, 722), halves)
+    wanted = check_poses(bar_problem, bar.vertices, bar.vertices[bar_problem.handles], halves == 1)
+    found = check_poses(bar_problem, bar.vertices, bar.vertices[bar_problem.handles], upper)
+    np.testing.assert_array_equal(found.counted, wanted.counted)
+    with pytest.raises(jd.InputError, match="no vertex belongs to part 0"):
+        check_parts(upper | ~upper, 722)
+    other = jd.select.border(jd.shapes.square())
+    with pytest.raises(jd.InputError, match=r"parts have shape \(9,\)"):
+        check_parts(other, 722)
+    with pytest.raises(jd.InputError, match=r"mask has shape \(9,\).*a jd.Selection of this mesh"):
+        check_poses(bar_problem, bar.vertices, None, other)

@@ -49,10 +49,38 @@ def test_json_groups_move_as_they_say(tmp_path, bar):
     np.testing.assert_allclose(targets, np.concatenate(want), atol=EXACT)
 
 
+def test_groups_by_expressions_are_those_by_their_indices(tmp_path, bar):
+    y = bar.vertices[:, 1]
+    motion = {"rotation": {"axis": [0, 0, 1], "degrees": 30}, "translation": [0, 5, 0]}
+    low, high = np.flatnonzero(y < 6), np.flatnonzero(y > 145)
+    by_index = [{"vertices": low.tolist()}, {"vertices": high.tolist(), **motion}]
+    want = jd.load_handles(write(tmp_path, *by_index), bar)
+    by_place = [{"where": "y < 6", "name": "foot"}, {"where": "y > 145", **motion}]
+    by_mask = [{"vertices": (y < 6).tolist()}, {"where": "v > 145 / 151", **motion}]
+    for groups in (by_place, by_mask):
+        found = jd.load_handles(write(tmp_path, *groups), bar)
+        np.testing.assert_array_equal(found.handles, want.handles)
+        np.testing.assert_array_equal(found.targets, want.targets)
+
+
+def test_a_wrong_expression_in_a_file_has_its_caret(tmp_path, bar):
+    with pytest.raises(jd.InputError) as caught:
+        jd.load_handles(write(tmp_path, {"where": "y < 6 &"}), bar)
+    assert caught.value.__notes__ == ["    y < 6 &\n          ^"]
+
+
 GOOD = {"vertices": [0, 1]}
 BAD_GROUPS = {
-    'group 0 has no "vertices"': [{"vertex": [0]}],
-    'group 1 has no "vertices"': [GOOD, [3, 4]],
+    'group 0: give either "vertices", a list of indices, or "where"': [{"vertex": [0]}],
+    'group 1: give either "vertices"': [GOOD, [3, 4]],
+    'group 2: give either "vertices"': [GOOD, {"where": "y < 6"}, {**GOOD, "where": "y < 6"}],
+    "group 0: where is a list: give a text such as 'y > 0.9": [{"where": [0, 1]}],
+    "group 0: where: found '=' .write ==. instead of .* at column 3 of 'y = 6'": [
+        {"where": "y = 6"}
+    ],
+    "group 0: where: 'y > 200' holds for no vertex: .*y from 0 to 151": [{"where": "y > 200"}],
+    "handles.json: vertex 0 is a handle 2 times": [GOOD, {"where": "x == x"}],
+    r"group 0: handles: the mask has shape \(2,\): give \(722,\)": [{"vertices": [True, False]}],
     "group 0: no handles": [{"vertices": []}],
     "group 0: handles have shape": [{"vertices": 3}],
     "group 0: handles must be integers, got float64": [{"vertices": [0.5]}],

@@ -1,0 +1,236 @@
+"""The command ``jaxdeform deform``."""
+
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+from jaxtyping import Float
+from typer.core import TyperCommand
+
+import jaxdeform as jd
+from jaxdeform._apps.arguments import MEDIUM, Material, read_material
+from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
+from jaxdeform._apps.results import save_result
+from jaxdeform._apps.talk import console, patiently, say_wrote, since
+from jaxdeform._mesh.files import check_output, format_of
+from jaxdeform._plotting import check_picture_path
+
+
+class Method(StrEnum):
+    """The methods, by their names on the command line."""
+
+    material = "material"
+    arap = "arap"
+    rc_arap = "rc-arap"
+    laplacian = "laplacian"
+
+
+# Options that a method does not read.
+_UNREAD = {
+    Method.material: (),
+    Method.arap: ("--rings", "--rigidity", "--stiff"),
+    Method.rc_arap: ("--rigidity", "--stiff"),
+    Method.laplacian: ("--rings", "--rigidity", "--stiff", "--steps", "--normals"),
+}
+
+
+class DeformCommand(TyperCommand):
+    """Takes ``--stiff EXPR VALUE`` several times, and refuses to forget the first of two motions.
+
+    Typer has options that may be repeated and options with two values, but none that are both. So
+    the two words go on as one, "EXPR: VALUE".
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words of the command."""
+        for name in ("--move", "--rotate", "--about", "--translate"):
+            if sum(word.split("=")[0] == name for word in args) > 1:
+                raise jd.InputError(
+                    f"{name} is given twice: join expressions by 'or'; groups that move "
+                    "differently go into a handle file (--handles)"
+                )
+        words = iter(args)
+        joined = []
+        for word in words:
+            joined.append(word)
+            if word == "--stiff":
+                pair = [value for _, value in zip(range(2), words, strict=False)]
+                joined += [": ".join(pair)] if pair else []
+        return super().parse_args(ctx, joined)
+
+
+_WHERE = "an expression of x, y, z, such as 'y < 0.1' (u, v, w: from 0 to 1 in the bounding box)"
+_Point = tuple[float, float, float] | None
+HandleFile = Annotated[
+    Path | None, typer.Option(help="Handle file: .json, or .sel with a .def of the same name.")
+]
+Fix = Annotated[
+    list[str] | None,
+    typer.Option(metavar="EXPR", help=f"Vertices that stay: {_WHERE}. May be repeated."),
+]
+Move = Annotated[str | None, typer.Option(metavar="EXPR", help="Vertices that move.")]
+Rotate = Annotated[
+    tuple[str, float] | None,
+    typer.Option(metavar="AXIS DEGREES", help="Rotate them about x, y or z."),
+]
+About = Annotated[
+    _Point,
+    typer.Option(metavar="X Y Z", help="Centre of the rotation. By default their centroid."),
+]
+Translate = Annotated[_Point, typer.Option(metavar="X Y Z", help="Then translate them.")]
+Rigidity = Annotated[
+    str | None,
+    typer.Option(
+        help="A number, or a PLY file with one rigidity per vertex. By default, that of a medium "
+        f"material: {MEDIUM} times the area of each cell."
+    ),
+]
+Stiff = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="EXPR VALUE",
+        help="Another rigidity for some vertices. May be repeated; the last one wins.",
+    ),
+]
+Rings = Annotated[
+    int | None, typer.Option(min=1, help="Size of the cells, in rings of vertices. By default 1.")
+]
+Steps = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of alternating steps. By default, until convergence (100 with --normals).",
+    ),
+]
+
+
+def deform(
+    mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Mesh file to write.")],
+    fix: Fix = None,
+    move: Move = None,
+    rotate: Rotate = None,
+    about: About = None,
+    translate: Translate = None,
+    handles: HandleFile = None,
+    motion: Annotated[
+        Path | None, typer.Option(help="The .def file of a .sel handle file.")
+    ] = None,
+    method: Annotated[Method, typer.Option(help="How the rest follows.")] = Method.material,
+    rigidity: Rigidity = None,
+    stiff: Stiff = None,
+    rings: Rings = None,
+    steps: Steps = None,
+    normals: Annotated[bool, typer.Option(help="Add the normal term (Eq. 4.7).")] = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG file for a picture of both shapes.")
+    ] = None,
+) -> None:
+    """Move some vertices of a mesh and hold others; the rest of it follows.
+
+    The vertices are chosen by --fix and --move, or by a handle file.
+    """
+    shape = jd.load_mesh(mesh)
+    # Check all arguments before the long work.
+    check_output(out, shape)
+    if picture is not None:
+        check_picture_path(picture)
+    options = {"--rigidity": rigidity, "--stiff": stiff, "--rings": rings}
+    options |= {"--steps": steps, "--normals": normals}
+    for name in _UNREAD[method]:
+        if options[name]:
+            raise jd.InputError(f"{name} means nothing to --method {method.value}: leave it out")
+    moves = _read_moves(shape, handles, motion, fix, move, Motion(rotate, about, translate))
+    material = read_material(shape, rigidity, stiff or [])
+    console.print(str(moves))
+    if method == Method.laplacian:
+        result = _edited(shape, moves)
+    else:
+        result = _deformed(shape, moves, _Settings(method, material, rings or 1, steps, normals))
+    # The result first, then words about it: whatever happens to those, the work is kept.
+    color = result.rigidity if format_of(out) == ".ply" else None
+    save_result(out, shape, result.vertices, color)
+    for line in result.words:
+        console.print(line)
+    say_wrote(out)
+    if picture is not None:
+        poses = [shape.vertices, result.vertices]
+        colors = [None, result.rigidity] if material.varies else []
+        jd.render(picture, shape, poses, titles=["rest", "deformed"], values=colors)
+        say_wrote(picture)
+
+
+def _read_moves(
+    shape: jd.Mesh,
+    handles: Path | None,
+    sel_motion: Path | None,
+    fix: list[str] | None,
+    move: str | None,
+    motion: Motion,
+) -> Moves:
+    given = {"--fix": fix, "--move": move}
+    given |= {f"--{name}": value for name, value in motion._asdict().items()}
+    named = [name for name, value in given.items() if value]
+    if handles is not None:
+        if named:
+            raise jd.InputError(
+                f"{named[0]} and --handles are two ways to choose vertices: give one of them"
+            )
+        return moves_of_file(shape, handles, sel_motion)
+    if sel_motion is not None:
+        raise jd.InputError("--motion is the .def file of a .sel file: give that by --handles")
+    if not named:
+        raise jd.InputError(
+            "no vertices are chosen: give --fix EXPR and --move EXPR with --rotate or --translate, "
+            "or --handles FILE"
+        )
+    return moves_by_place(shape, fix or [], move, motion)
+
+
+class _Settings(NamedTuple):
+    method: Method
+    material: Material
+    rings: int
+    steps: int | None
+    normals: bool
+
+
+class _Result(NamedTuple):
+    vertices: Float[np.ndarray, "vertices 3"]
+    rigidity: Float[np.ndarray, "vertices"] | None
+    words: list[str]
+
+
+def _edited(shape: jd.Mesh, moves: Moves) -> _Result:
+    began = time.perf_counter()
+    edit = patiently("editing", lambda: jd.laplacian_editing(shape, moves.handles, moves.targets))
+    return _Result(np.asarray(edit), None, [f"edited in {since(began)}"])
+
+
+def _deformed(shape: jd.Mesh, moves: Moves, settings: _Settings) -> _Result:
+    method, material, rings, steps, normals = settings
+    began = time.perf_counter()
+    cells = jd.spokes(shape) if method == Method.arap else jd.rings(shape, rings)
+    problem = patiently("precomputing", lambda: jd.precompute(shape, moves.handles, cells=cells))
+    console.print(f"{shape}, {len(moves.handles)} handles: precomputed in {since(began)}")
+    began = time.perf_counter()
+    solver = None if steps is None else jd.Alternating(steps)
+    own = method == Method.material
+    # Cells that only rotate have no strain, and so no use for a rigidity.
+    values = material.at(problem) if own else np.zeros(shape.n_vertices)
+    local = jd.Newton() if own else jd.RotationFit()
+    solution = patiently(
+        "deforming",
+        lambda: jd.deform(
+            problem, moves.targets, values, local=local, solver=solver, normals=normals
+        ),
+    )
+    energy, done = float(solution.energy[-1]), int(solution.steps)
+    words = [
+        f"energy {energy:.6g} after {done} steps in {since(began)}",
+        jd.Result[solution.result],
+    ]
+    return _Result(np.asarray(solution.vertices), values if own else None, words)

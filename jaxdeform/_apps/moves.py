@@ -1,0 +1,83 @@
+"""Which vertices the command ``deform`` holds, and where it moves them."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+import jaxdeform as jd
+from jaxdeform._mesh.select import some_where
+
+
+class Moves(NamedTuple):
+    """The handles of a command."""
+
+    handles: Int[np.ndarray, "handles"]
+    targets: Float[np.ndarray, "handles 3"]
+    moved: Bool[np.ndarray, "handles"]
+    """False for a handle that stays where it is."""
+
+    def __str__(self) -> str:
+        """Return how many vertices were chosen."""
+        moved = int(self.moved.sum())
+        return f"fixed: {len(self.moved) - moved} vertices, moved: {moved} vertices"
+
+
+class Motion(NamedTuple):
+    """The rigid motion of the moved vertices, as the options give it."""
+
+    rotate: tuple[str, float] | None
+    """Axis and degrees."""
+    about: tuple[float, float, float] | None
+    """A point on the axis; by default the centroid of the moved vertices."""
+    translate: tuple[float, float, float] | None
+
+    def check(self) -> None:
+        """Raise InputError unless it moves something."""
+        if not (self.rotate or self.translate):
+            raise jd.InputError(
+                "--move needs --rotate AXIS DEGREES, --translate X Y Z, or both; to hold vertices "
+                "use --fix"
+            )
+        if self.about and not self.rotate:
+            raise jd.InputError("--about is the centre of a rotation: give --rotate AXIS DEGREES")
+
+    def of(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+        """Return where these points move to: rotated, then translated."""
+        option = "--rotate"
+        try:
+            if self.rotate:
+                axis, degrees = self.rotate
+                points = np.asarray(jd.rotate(points, degrees, axis=axis, center=self.about))
+            option = "--translate"
+            return np.asarray(jd.translate(points, self.translate or (0.0, 0.0, 0.0)))
+        except jd.InputError as error:
+            raise jd.InputError(f"{option}: {error}") from error
+
+
+def moves_of_file(mesh: jd.Mesh, path: Path, motion: Path | None) -> Moves:
+    handles, targets = jd.load_handles(path, mesh, motion)
+    return Moves(handles, targets, (targets != mesh.vertices[handles]).any(axis=1))
+
+
+def moves_by_place(mesh: jd.Mesh, fix: list[str], move: str | None, motion: Motion) -> Moves:
+    """Return the moves of vertices that expressions choose, or raise InputError."""
+    fixed = jd.select.mask(mesh, np.zeros(mesh.n_vertices, bool))
+    for expression in fix:
+        fixed |= some_where(mesh, expression, "--fix")
+    if move is None:
+        raise jd.InputError("nothing moves: give --move EXPR with --rotate or --translate")
+    motion.check()
+    moved = some_where(mesh, move, "--move")
+    both = fixed & moved
+    if len(both):
+        raise jd.InputError(
+            f"--fix and --move both choose {len(both)} vertices (vertex {both.vertices[0]}): let "
+            "one of them leave these out"
+        )
+    handles = (fixed | moved).vertices
+    grabbed = moved.mask[handles]
+    targets = mesh.vertices[handles]
+    targets[grabbed] = motion.of(targets[grabbed])
+    return Moves(handles, targets, grabbed)

@@ -1,0 +1,52 @@
+"""What a command says while it works."""
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import TextIO, TypeVar, cast
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from jaxdeform._apps.mouth import Mouth
+from jaxdeform._errors import printable
+
+# Print file names unchanged: brackets are not markup, and lines are not wrapped.
+mouth = Mouth()
+console = Console(file=cast(TextIO, mouth), highlight=False, markup=False, soft_wrap=True)
+
+Out = TypeVar("Out")
+
+Out = TypeVar("Out")
+
+
+def patiently(what: str, work: Callable[[], Out]) -> Out:
+    """Run work in another thread and show how long it takes.
+
+    While JAX computes, its thread does not receive Ctrl-C; the main thread, which waits, does.
+    """
+    outcome: Future[Out] = Future()
+
+    def run() -> None:
+        try:
+            outcome.set_result(work())
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    columns = SpinnerColumn(), TextColumn(what, markup=False), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        bar.add_task(what, total=None)
+        threading.Thread(target=run, daemon=True).start()
+        return outcome.result()
+
+
+def say_wrote(*names: Path) -> None:
+    console.print(f"wrote {printable(' and '.join(map(str, names)))}")
+
+
+def since(began: float) -> str:
+    return f"{time.perf_counter() - began:.2f} s"

@@ -1,0 +1,66 @@
+"""Distances along the surface of a mesh."""
+
+import igl
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxdeform._checks import check_type
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.selection import check_handles
+
+
+def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "vertices controls"]:
+    """Return the distance along the surface from every vertex to each source.
+
+    The distance is exact on the polyhedron, and infinite between different connected components.
+    libigl computes it by the method of Mitchell, Mount and Papadimitriou, "The discrete geodesic
+    problem" (1987), doi:10.1137/0216045. On a cactus of 5,300 vertices, one source takes 0.7 s.
+
+    **Arguments**
+
+    - mesh: the surface, closed or open.
+    - sources: (controls,), vertex indices, a mask or a selection.
+
+    **Returns** (vertices, controls), in the unit of the mesh.
+
+    **Raises** InputError: a source is out of range or repeated; an edge has more than two faces, or
+    surfaces meet in a single vertex (libigl would crash or return zeros).
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> jd.geodesic_distances(jd.shapes.square(), [4])[0].round(6).tolist()
+        [1.414214]
+    """
+    check_type("mesh", mesh, Mesh)
+    index = check_handles(sources, mesh, name="source")
+    faces = _manifold_faces(mesh)
+    return np.stack([_distances(mesh, faces, index[[k]]) for k in range(len(index))], axis=1)
+
+
+def distances_to_nearest(
+    mesh: Mesh, sources: Int[np.ndarray, "sources"]
+) -> Float[np.ndarray, "vertices"]:
+    """Return the distance along the surface to the nearest source, for about the time of one."""
+    return _distances(mesh, _manifold_faces(mesh), sources)
+
+
+def _manifold_faces(mesh: Mesh) -> Int[np.ndarray, "solid 3"]:
+    faces = np.ascontiguousarray(mesh.solid_faces)
+    used = np.unique(faces)
+    if not (igl.is_edge_manifold(faces)[0] and np.ravel(igl.is_vertex_manifold(faces))[used].all()):
+        raise InputError("geodesic distances need a manifold surface: see jd.inspect(mesh)")
+    return faces
+
+
+def _distances(mesh: Mesh, faces, sources) -> Float[np.ndarray, "vertices"]:
+    label = mesh.components
+    out = np.full(mesh.n_vertices, np.inf)
+    none = np.array([], np.int64)
+    # Where no path exists libigl returns 0, so ask only for vertices that have one.
+    reached = np.flatnonzero(np.isin(label, label[sources]) & mesh.referenced)
+    if len(reached):
+        on = sources[mesh.referenced[sources]]
+        out[reached] = igl.exact_geodesic(mesh.vertices, faces, on, none, reached, none)
+    out[sources] = 0.0
+    return out

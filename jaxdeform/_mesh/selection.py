@@ -1,0 +1,174 @@
+"""A set of vertices of a mesh, and the way in for every argument that chooses vertices."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxdeform._arrays import read_integers, read_numbers
+from jaxdeform._checks import check_index
+from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """A set of vertices of one mesh. Made by the functions of ``jd.select``.
+
+    ``a | b`` has the vertices of either, ``a & b`` of both, ``a - b`` of a only, and ``~a`` all
+    others. The other side may also be a mask (vertices,) or a list of vertex indices.
+
+    A selection stands wherever a function takes vertex indices, and as an index of NumPy's arrays:
+    ``mesh.vertices[selection]``. (JAX's take ``selection.vertices``.) Its vertices are in ascending
+    order. It is a value: two selections of the same vertices of equal meshes are equal.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> ends = jd.select.where(mesh, "y < 6") | jd.select.where(mesh, "y > 145")
+        >>> ends
+        Selection(146 of 722 vertices)
+        >>> jd.precompute(mesh, ends).handles.shape
+        (146,)
+    """
+
+    mesh: Mesh
+    """The mesh whose vertices they are."""
+    mask: Bool[np.ndarray, "vertices"]
+    """True for each vertex of the selection. Read-only; for values per vertex, such as
+    ``np.where(selection.mask, 30.0, 0.01)``."""
+
+    # Else NumPy would work on the indices in ``mask & selection``, instead of asking __rand__.
+    __array_ufunc__ = None
+
+    def __post_init__(self) -> None:
+        """Freeze the mask."""
+        self.mask.setflags(write=False)
+
+    @cached_property
+    def vertices(self) -> Int[np.ndarray, "chosen"]:
+        """Indices of the vertices, in ascending order."""
+        return np.flatnonzero(self.mask)
+
+    def __len__(self) -> int:
+        """Return the number of vertices of the selection."""
+        return len(self.vertices)
+
+    def __iter__(self) -> Iterator[int]:
+        """Return the indices one by one."""
+        return iter(self.vertices.tolist())
+
+    def __array__(self, dtype=None, copy: bool | None = None) -> np.ndarray:
+        """Return the indices, for NumPy."""
+        return np.array(self.vertices, dtype, copy=copy)
+
+    def __invert__(self) -> "Selection":
+        """Return all other vertices of the mesh."""
+        return Selection(self.mesh, ~self.mask)
+
+    def __or__(self, other: ArrayLike) -> "Selection":
+        """Return the vertices of either."""
+        return self._joined(other, np.logical_or)
+
+    def __and__(self, other: ArrayLike) -> "Selection":
+        """Return the vertices of both."""
+        return self._joined(other, np.logical_and)
+
+    def __sub__(self, other: ArrayLike) -> "Selection":
+        """Return the vertices of this selection that are not in the other."""
+        return self._joined(other, np.greater)
+
+    def __rsub__(self, other: ArrayLike) -> "Selection":
+        """Return the vertices of the other that are not in this selection."""
+        return self._joined(other, np.less)
+
+    __ror__ = __or__
+    __rand__ = __and__
+
+    def _joined(self, other: ArrayLike, join: Callable) -> "Selection":
+        return Selection(self.mesh, join(self.mask, read_mask("the other side", other, self.mesh)))
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other selection has the same vertices, of an equal mesh."""
+        if not isinstance(other, Selection):
+            return False
+        return np.array_equal(self.mask, other.mask) and self.mesh == other.mesh
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash((self.mesh, self.mask.tobytes()))
+
+    def __repr__(self) -> str:
+        """Return the sizes, not the vertices."""
+        return f"Selection({len(self)} of {self.mesh.n_vertices} vertices)"
+
+
+def read_vertices(
+    name: str, value: ArrayLike, mesh: Mesh, unit: str = "vertex"
+) -> Int[np.ndarray, "chosen"]:
+    """Return vertex indices from indices, a mask or a selection, or raise InputError.
+
+    Indices keep their order and may repeat; those of a mask or a selection are ascending.
+    """
+    n = mesh.n_vertices
+    if isinstance(value, Selection):
+        if value.mesh.n_vertices != n:
+            raise InputError(
+                f"{name}: the selection is of another mesh ({value.mesh}, not {mesh}): select on "
+                "this one"
+            )
+        return value.vertices
+    given = read_numbers(value, name)
+    if given.dtype == bool:
+        if given.shape != (n,):
+            raise InputError(
+                f"{name}: the mask has shape {given.shape}: give ({n},), one boolean per vertex, "
+                "or vertex indices"
+            )
+        return np.flatnonzero(given)
+    given = read_integers(given, name, "give vertex indices, a mask of booleans or a jd.Selection")
+    if given.ndim != 1:
+        raise InputError(
+            f"{name} {'have' if name.endswith('s') else 'has'} shape {given.shape}: give one list "
+            "of vertex indices, a mask of booleans or a jd.Selection"
+        )
+    check_index(unit, given, n)
+    return given
+
+
+def read_mask(
+    name: str, value: ArrayLike, mesh: Mesh, unit: str = "vertex"
+) -> Bool[np.ndarray, "vertices"]:
+    """Return a mask from indices, a mask or a selection, or raise InputError."""
+    mask = np.zeros(mesh.n_vertices, bool)
+    mask[read_vertices(name, value, mesh, unit)] = True
+    return mask
+
+
+def check_handles(
+    handles: ArrayLike, mesh: Mesh, *, name: str = "handle"
+) -> Int[np.ndarray, "handles"]:
+    """Return the handle indices as an array, or raise InputError naming what is wrong."""
+    given = read_vertices(f"{name}s", handles, mesh, name)
+    if given.size == 0:
+        empty = f" (the selection is empty: {ranges(mesh)})"
+        raise InputError(
+            f"no {name}s{empty if isinstance(handles, Selection) else ''}: without one the mesh "
+            "could lie anywhere; give at least one"
+        )
+    unique, count = np.unique(given, return_counts=True)
+    if (count > 1).any():
+        raise InputError(
+            f"vertex {unique[count > 1][0]} is a {name} {count.max()} times: list it once, because "
+            "it can have only one target"
+        )
+    return given
+
+
+def ranges(mesh: Mesh) -> str:
+    """Return the range of each coordinate, for an error about a choice that holds no vertex."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    x, y, z = (f"from {a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
+    return f"x runs {x}, y {y}, z {z}"
