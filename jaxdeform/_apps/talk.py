@@ -19,8 +19,6 @@ console = Console(file=cast(TextIO, mouth), highlight=False, markup=False, soft_
 
 Out = TypeVar("Out")
 
-Out = TypeVar("Out")
-
 
 def patiently(what: str, work: Callable[[], Out]) -> Out:
     """Run work in another thread and show how long it takes.

@@ -1,0 +1,136 @@
+"""The command ``jaxdeform estimate``."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+import jaxdeform as jd
+from jaxdeform._apps.arguments import choose_parts, read_pose
+from jaxdeform._apps.results import as_json
+from jaxdeform._apps.talk import console, patiently, say_wrote, since
+from jaxdeform._errors import printable
+from jaxdeform._estimation.held_out import prediction_errors
+from jaxdeform._mesh.files import check_output, format_of, without_suffix
+from jaxdeform._mesh.writing import check_place, write_atomically
+
+
+def estimate(
+    rest: Annotated[Path, typer.Argument(help="The undeformed mesh: OBJ, OFF, PLY or STL file.")],
+    poses: Annotated[list[Path], typer.Argument(help="Deformed meshes with the same faces.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help=".ply file for the rigidity.")],
+    handles: Annotated[
+        Path | None, typer.Option(help="Handle file. By default, the vertices that moved rigidly.")
+    ] = None,
+    parts: Annotated[
+        Path | None,
+        typer.Option(help="The part of each vertex, from 0: one number per line, or .json."),
+    ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EXPR",
+            help="Vertices of part 1; given again, of part 2, ... All others are part 0.",
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            help="How exactly handles must have moved rigidly to be found, as a fraction of the "
+            "bounding box diagonal."
+        ),
+    ] = 1e-6,
+    rings: Annotated[int, typer.Option(min=1, help="Size of the cells, in rings of vertices.")] = 1,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of alternating steps. By default, until convergence."),
+    ] = None,
+    hold_out: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Leave out so many poses, the last ones, and report how well they are predicted, "
+            "beside ARAP. Found handles are those of all poses.",
+        ),
+    ] = 0,
+) -> None:
+    """Estimate the rigidity of a mesh or of its parts from deformed poses."""
+    if hold_out >= len(poses):
+        raise jd.InputError(
+            f"--hold-out {hold_out} leaves none of the {len(poses)} poses to fit: give fewer"
+        )
+    shape = jd.load_mesh(rest)
+    report = _check_names(out)
+    observed = np.stack([read_pose(path, shape, rest) for path in poses])
+    label = choose_parts(parts, part or [], shape)
+    if handles is None:
+        index = _moved_rigidly(shape, observed, tolerance)
+    else:
+        index = jd.load_handles(handles, shape).handles
+    began = time.perf_counter()
+    problem = patiently(
+        "precomputing", lambda: jd.precompute(shape, index, cells=jd.rings(shape, rings))
+    )
+    fitted, kept = np.split(observed, [len(poses) - hold_out])
+    fit = _fit(problem, fitted, label, steps)
+    jd.save_mesh(out, shape, rigidity=fit.field)
+    text = json.dumps(as_json(fit, index), indent=1, allow_nan=False)
+    write_atomically(report, f"{text}\n".encode())
+    console.print(f"{fit.explain()}\nestimated in {since(began)}")
+    if hold_out:
+        _report_held_out(problem, kept, poses[-hold_out:], fit.field)
+    say_wrote(out, report)
+
+
+def _fit(problem: jd.Problem, observed, label: np.ndarray, steps: int | None) -> jd.Estimate:
+    solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
+    return patiently(
+        "estimating",
+        lambda: jd.estimate_rigidity(
+            problem, observed, parts=label, solver=solver, progress=_show_evaluation
+        ),
+    )
+
+
+def _check_names(out: Path) -> Path:
+    """Return the name of the report beside the PLY file, or raise InputError."""
+    check_output(out)
+    if format_of(out) != ".ply":
+        raise jd.InputError(f"{out}: only PLY carries rigidity per vertex: use a .ply name")
+    report = without_suffix(out).with_suffix(".json")
+    check_place(report)
+    return report
+
+
+def _report_held_out(
+    problem: jd.Problem, observed: np.ndarray, names: list[Path], field: np.ndarray
+) -> None:
+    """Predict poses that were not fitted, by the estimate and by ARAP."""
+    table = Table("held out", "error, % of the diagonal", "ARAP")
+    ours, arap = patiently(
+        "predicting",
+        lambda: (
+            prediction_errors(problem, observed, field, jd.Newton()),
+            prediction_errors(problem, observed, 0.0, jd.RotationFit()),
+        ),
+    )
+    for name, mine, rigid in zip(names, ours, arap, strict=True):
+        table.add_row(printable(name.name), f"{100 * mine:.3g}", f"{100 * rigid:.3g}")
+    console.print(table)
+
+
+def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.ndarray:
+    groups = jd.find_handle_groups(mesh, observed, tolerance=tolerance)
+    sizes = ", ".join(str(len(group.vertices)) for group in groups[:10])
+    more = ", ..." if len(groups) > 10 else ""
+    console.print(f"handles: {len(groups)} groups of vertices moved rigidly ({sizes}{more})")
+    return np.unique(np.concatenate([group.vertices for group in groups]))
+
+
+def _show_evaluation(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
+    values = ", ".join(f"{value:.3g}" for value in rigidity[:5])
+    console.print(f"evaluation {evaluation}: misfit {misfit:.4g}, rigidity {values}")
