@@ -59,18 +59,15 @@ def estimate(
     ] = 0,
 ) -> None:
     """Estimate the rigidity of a mesh or of its parts from deformed poses."""
-    if hold_out >= len(poses):
-        raise jd.InputError(
-            f"--hold-out {hold_out} leaves none of the {len(poses)} poses to fit: give fewer"
-        )
+    _check_hold_out(hold_out, len(poses))
     shape = jd.load_mesh(rest)
     report = _check_names(out)
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
     label = choose_parts(parts, part or [], shape)
-    if handles is None:
-        index = _moved_rigidly(shape, observed, tolerance)
-    else:
+    if handles:
         index = jd.load_handles(handles, shape).handles
+    else:
+        index = _moved_rigidly(shape, observed, tolerance)
     began = time.perf_counter()
     problem = patiently(
         "precomputing", lambda: jd.precompute(shape, index, cells=jd.rings(shape, rings))
@@ -78,8 +75,7 @@ def estimate(
     fitted, kept = np.split(observed, [len(poses) - hold_out])
     fit = _fit(problem, fitted, label, steps)
     jd.save_mesh(out, shape, rigidity=fit.field)
-    text = json.dumps(as_json(fit, index), indent=1, allow_nan=False)
-    write_atomically(report, f"{text}\n".encode())
+    write_atomically(report, _as_text(fit, index))
     console.print(f"{fit.explain()}\nestimated in {since(began)}")
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
@@ -94,6 +90,17 @@ def _fit(problem: jd.Problem, observed, label: np.ndarray, steps: int | None) ->
             problem, observed, parts=label, solver=solver, progress=_show_evaluation
         ),
     )
+
+
+def _check_hold_out(hold_out: int, count: int) -> None:
+    if hold_out >= count:
+        raise jd.InputError(
+            f"--hold-out {hold_out} leaves none of the {count} poses to fit: give fewer"
+        )
+
+
+def _as_text(fit: jd.Estimate, handles: np.ndarray) -> bytes:
+    return f"{json.dumps(as_json(fit, handles), indent=1, allow_nan=False)}\n".encode()
 
 
 def _check_names(out: Path) -> Path:
