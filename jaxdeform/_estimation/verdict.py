@@ -9,8 +9,9 @@ from jaxtyping import Float
 class Verdict(Enum):
     """What the poses say of a part.
 
-    One rule: a side of the interval is open if its end is more than a factor (10, unless
-    ``determined_within`` says otherwise) from the best value.
+    One rule: a side of the interval is open if it reaches 0 or infinity, or if, with the other
+    side bounded, its end is more than a factor (10, unless ``determined_within`` says otherwise)
+    from the best value.
 
     - determined: both sides are closed.
     - at_least: only the lower one is, and its end is the bound.
@@ -32,7 +33,9 @@ class Verdict(Enum):
     def of(cls, value: float, interval: Float[np.ndarray, "2"], factor: float) -> "Verdict":
         """Return the verdict on a value with an interval."""
         low, high = interval
-        below, above = low >= value / factor, high <= value * factor
+        # Where one side is unbounded, so is the best value: the other end stands for itself.
+        below = low > 0.0 if np.isinf(high) else low >= value / factor
+        above = high < np.inf if low == 0.0 else high <= value * factor
         if below and above:
             return cls.determined
         if below:

@@ -83,7 +83,7 @@ def small():
 
 
 def test_the_step_solves_the_normal_equations(small):
-    """To 1e-2 of the right-hand side, as conjugate gradients are told."""
+    """To 3e-2 of the right-hand side, as conjugate gradients are told."""
     jacobian, matrix, solve = small
     draw = np.random.default_rng(1)
     residual = jax.eval_shape(jacobian.mv, jnp.zeros(9))
@@ -91,7 +91,7 @@ def test_the_step_solves_the_normal_equations(small):
     operator = lx.FunctionLinearOperator(jacobian.mv, jax.ShapeDtypeStruct((9,), jnp.float64))
     step = np.asarray(eqx.filter_jit(solve)(operator, residual))
     right = -matrix.T @ np.concatenate(residual)
-    assert np.linalg.norm(matrix.T @ matrix @ step - right) <= 0.01 * np.linalg.norm(right)
+    assert np.linalg.norm(matrix.T @ matrix @ step - right) <= 0.03 * np.linalg.norm(right)
 
 
 class Linear:
@@ -173,7 +173,7 @@ def test_a_smooth_field_is_recovered_from_three_poses(bar, bar_problem):
     true = 0.01 * 1000.0 ** (bar.vertices[:, 1] / 151.0)
     poses = np.stack([np.asarray(jd.deform(bar_problem, t, true).vertices) for t in targets])
     assert len(ends(bar)) == len(points)
-    fit = jd.estimate_rigidity_field(bar_problem, poses, smoothness=1e-9)
+    fit = jd.estimate_rigidity_field(bar_problem, poses, smoothness=1e-9, max_evaluations=20)
     assert np.median(np.abs(fit.field / true - 1)) < 0.1
 
 

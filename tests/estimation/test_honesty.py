@@ -61,7 +61,9 @@ def test_a_warp_of_the_scan_is_covered_and_said(bar, bar_problem, bar_targets, p
     fit = jd.estimate_rigidity(bar_problem, seen, targets=bar_targets if known else None)
     check_it_is_said(fit, 0.0)
     assert fit.interval[0, 0] <= 20.0 <= fit.interval[0, 1]
-    np.testing.assert_allclose(fit.discrepancy.relative, 0.002 / np.sqrt(2), rtol=0.5)
+    # Observed handles are warped too, and carry a part of it.
+    size = 0.002 / np.sqrt(2)
+    assert (0.5 if known else 0.2) * size < fit.discrepancy.relative < 1.5 * size
 
 
 def test_right_models_are_not_accused(bar, bar_problem, bar_targets, pose):
