@@ -14,8 +14,8 @@ from jaxdeform._deformation.problem import Problem
 from jaxdeform._linalg.cholesky import Factor, factorise
 from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian, lifted_weights
 
-# Conjugate gradients of one Gauss-Newton step, which need not be exact: 1e-2 and 60 take three times
-# as long for the same field.
+# Conjugate gradients of one Gauss-Newton step, which need not be exact: 1e-2 and 60 steps take
+# three times as long for the same field.
 _CG_TOLERANCE, _CG_STEPS = 3e-2, 30
 # Vertices whose variances are solved for together.
 _TOGETHER = 256
