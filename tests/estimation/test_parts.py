@@ -113,31 +113,31 @@ def test_one_part_or_two_halves_have_the_same_verdict(bar, bar_problem, halves):
 def test_intervals_cover_the_truth(
     bar, bar_problem, bar_targets, equilibrium_of, targets_known, first
 ):
-    """40 seeds: a right 95 % interval covers in 36 or more of them with probability 0.95.
+    """20 seeds: a right 95 % interval covers in 17 or more of them with probability 0.98.
 
     With observed targets the handles are noisy too. test_spectrum.py has the many draws.
     """
     pose, hits = equilibrium_of(0.1), 0
     targets = bar_targets if targets_known else None
-    for seed in range(first, first + 40):
+    for seed in range(first, first + 20):
         fit = jd.estimate_rigidity(bar_problem, noisy(bar, pose, seed), targets=targets)
         low, high = fit.interval[0]
         hits += low <= 0.1 <= high
-    assert hits >= 36
+    assert hits >= 17
 
 
 @pytest.mark.slow
 def test_measured_targets_must_be_called_so(bar, bar_problem, equilibrium_of):
     """Measured handles, given as exact, make the interval too narrow; as noisy, it covers."""
     hits = np.zeros(2)
-    for seed in range(10):
+    for seed in range(6):
         seen = noisy(bar, equilibrium_of(20.0), seed)
         for k, noise in enumerate((0.0, 1.0)):
             fit = jd.estimate_rigidity(
                 bar_problem, seen, targets=seen[bar_problem.handles], target_noise=noise
             )
             hits[k] += fit.interval[0, 0] <= 20.0 <= fit.interval[0, 1]
-    assert hits[0] <= 8 < hits[1]
+    assert hits[0] <= 4 < hits[1]
 
 
 # ---------------------------------------------------------------- misuse
