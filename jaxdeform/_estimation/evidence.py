@@ -29,12 +29,10 @@ class Patterns(NamedTuple):
 
     vectors: Float[np.ndarray, "vertices patterns"]
     """Orthonormal in the metric of the prior."""
-    effects: Float[np.ndarray, "poses vertices 3 patterns"]
-    """J times the vectors: orthogonal."""
     strength: Float[np.ndarray, "patterns"]
-    """Squares of their lengths."""
+    """Squares of the lengths of J times the vectors, which are orthogonal."""
     data: Float[np.ndarray, "patterns"]
-    """Products with y = J t - residual."""
+    """Products of these with y = J t - residual."""
     size: float
     """Square of y."""
 
@@ -48,15 +46,9 @@ def find_patterns(run: Any, prior: Prior) -> Patterns:
     flat = np.linalg.solve(root, effects.reshape(-1, len(metric)).T).T
     _, lengths, turn = np.linalg.svd(flat, full_matrices=False)
     vectors = np.linalg.solve(root, vectors.T).T @ turn.T
-    flat = flat @ turn.T
     seen = np.asarray(run.jacobian.mv(run.theta - jnp.mean(run.theta)) - run.residual, float)
-    return Patterns(
-        vectors,
-        flat.reshape(*effects.shape[:-1], -1),
-        lengths**2,
-        flat.T @ seen.ravel(),
-        float(np.sum(seen**2)),
-    )
+    data = turn @ (flat.T @ seen.ravel())
+    return Patterns(vectors, lengths**2, data, float(np.sum(seen**2)))
 
 
 @eqx.filter_jit

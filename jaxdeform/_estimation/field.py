@@ -149,8 +149,7 @@ def estimate_rigidity_field(
     bounds = log_bounds(size).astype(problem.dtype)
     theta = np.clip(np.log(check_start(start, medium, "vertex")), *bounds)
     found = _Search(problem, poses, bounds, solver, adjoint, max_evaluations, progress)
-    best, weight, result = found.run(theta, smoothness)
-    patterns = find_patterns(best, found.prior)
+    best, weight, result, patterns = found.run(theta, smoothness)
     noise = found.evidence(patterns, (weight, weight)).noise
     spread = deviations(patterns, found.prior.variances(), Evidence(weight, noise))
     theta = np.asarray(best.theta, np.float64)
@@ -193,17 +192,14 @@ class _Search:
         self.prior = Prior.of(problem)
         self.history: list[float] = []
 
-    def run(self, theta, smoothness: float | None) -> "tuple[_Linearised, float, Result]":
-        """Return the last evaluation, the weight of the prior, and how the search ended."""
+    def run(self, theta, smoothness: float | None) -> "_Found":
+        """Search under the smoothness given, or under the one that the poses make most probable."""
         unit = self.problem.mesh.diagonal**2
-        first = self._evaluate(theta)
-        if smoothness is not None:
-            return self._relax(first, unit * _stages(smoothness))
-        found = self._relax(first, unit * _stages(_FIRST))
-        for _ in range(_ROUNDS):
-            run, weight, result = found
-            ends = unit * _ROUGHEST, unit * _SMOOTHEST
-            better = self.evidence(find_patterns(run, self.prior), ends).weight
+        ends = unit * _ROUGHEST, unit * _SMOOTHEST
+        found = self._relax(self._evaluate(theta), unit * _stages(smoothness or _FIRST))
+        for _ in range(0 if smoothness else _ROUNDS):
+            run, weight, result, patterns = found
+            better = self.evidence(patterns, ends).weight
             if max(better / weight, weight / better) < _SAME or not succeeded(result):
                 break
             # Down by the stages that are left; up at once.
@@ -215,13 +211,14 @@ class _Search:
         """Return the most probable weight and noise."""
         return most_probable(patterns, self.poses.count, same_length(self.problem), ends)
 
-    def _relax(self, run, weights) -> "tuple[_Linearised, float, Result]":
+    def _relax(self, run, weights) -> "_Found":
         """Search under each weight, under the last to the end."""
         for weight in weights[:-1]:
             run = self._descend(run, weight, _STAGE_EVALUATIONS).best.run
         left = self.limit - len(self.history)
         found = self._descend(run, weights[-1], max(left, 0))
-        return found.best.run, float(weights[-1]), found.result
+        run = found.best.run
+        return _Found(run, float(weights[-1]), found.result, find_patterns(run, self.prior))
 
     def _descend(self, run, weight, limit: int) -> Found:
         first = _FieldFit(run, self.prior, jnp.asarray(weight, run.theta.dtype))
@@ -266,6 +263,15 @@ def _linearise_at(problem, poses: Poses, theta, state, solver, adjoint) -> _Line
     residual, push, vertices = jax.linearize(run, theta, has_aux=True)
     jacobian = lx.FunctionLinearOperator(push, jax.eval_shape(lambda: theta))
     return _Linearised(theta, vertices, residual, jacobian)
+
+
+class _Found(NamedTuple):
+    """Where a search under one weight ended, and what the poses tell of the field there."""
+
+    run: _Linearised
+    weight: float
+    result: Result
+    patterns: Patterns
 
 
 class _FieldFit(NamedTuple):

@@ -105,6 +105,6 @@ class PartModel:
 
     def positions(self, theta: np.ndarray) -> Float[np.ndarray, "poses vertices 3"]:
         """Deform into all poses, without derivatives."""
-        field = np.exp(theta)[self.label].astype(self.problem.dtype)
+        field = self.field(theta).astype(self.problem.dtype)
         ends = states(self.problem, self.poses, field, self.solver, self.adjoint)
         return np.stack([np.asarray(end.vertices) for end in ends])

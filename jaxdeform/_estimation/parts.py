@@ -54,7 +54,8 @@ class Estimate:
     - field: (vertices,) the rigidity of each vertex, as :func:`deform` takes it.
     - vertices: (poses, vertices, 3) the fitted poses.
     - misfit: root mean square of the differences between fitted and observed coordinates (a
-      length); relative_misfit: the same as a fraction of the bounding box diagonal.
+      length).
+    - diagonal: of the bounding box of the rest shape; relative_misfit: misfit / diagonal.
     - solver_error: root mean square distance of the solver's end from the minimum (a length). The
       intervals allow for as much in the observed poses; a smaller misfit says nothing.
     - outliers: (poses, vertices) True where a vertex was left out, because it was seen far from
@@ -72,7 +73,7 @@ class Estimate:
     field: Float[np.ndarray, "vertices"]
     vertices: Float[np.ndarray, "poses vertices 3"]
     misfit: float
-    relative_misfit: float
+    diagonal: float
     solver_error: float
     outliers: Bool[np.ndarray, "poses vertices"]
     history: Float[np.ndarray, "evaluations"]
@@ -82,6 +83,11 @@ class Estimate:
     def ok(self) -> bool:
         """True if the search converged and the model explains the poses."""
         return bool(succeeded(self.result))
+
+    @property
+    def relative_misfit(self) -> float:
+        """The misfit as a fraction of the diagonal."""
+        return self.misfit / self.diagonal
 
     def explain(self) -> str:
         """Return everything in words, a line for each part and each fact."""
@@ -107,8 +113,7 @@ class Estimate:
         text = f"part {k}: {in_words(self.verdict[k], self.rigidity[k], self.interval[k])}"
         if self.verdict[k] is Verdict.determined:
             text += f", material {self.material[k]:.3g}"
-        diagonal = self.misfit / self.relative_misfit if self.relative_misfit else np.inf
-        hidden = self.displacement[k] < _VISIBLE * diagonal
+        hidden = self.displacement[k] < _VISIBLE * self.diagonal
         kinds = [kind for kind, unseen in zip(("softer", "stiffer"), hidden, strict=True) if unseen]
         if kinds:
             text += f"; {' or '.join(kinds)} makes no visible difference"
@@ -303,7 +308,7 @@ def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
         field=model.field(best.theta),
         vertices=best.vertices,
         misfit=misfit,
-        relative_misfit=misfit / diagonal,
+        diagonal=diagonal,
         solver_error=solver_error,
         outliers=counted & ~poses.counted,
         history=np.array(found.history),

@@ -76,16 +76,18 @@ def check_poses(problem: Any, observed: Any, targets: Any, mask: Any) -> Poses:
             f"poses do not depend on the rigidity; {move}"
         )
     check_resemblance(problem, given, seen, goal if targets is not None else None)
-    known = np.where(counted[..., None], given, 0.0).astype(problem.dtype)
-    return Poses(goal, known, counted, _starts(problem, known, counted, goal))
+    return _compared(problem, goal, given, counted)
 
 
 def without(problem: Problem, poses: Poses, dropped: Bool[np.ndarray, "poses vertices"]) -> Poses:
     """Return the poses as if these vertices had not been seen."""
-    counted = poses.counted & ~dropped
-    observed = np.where(counted[..., None], poses.observed, 0.0).astype(problem.dtype)
-    start = _starts(problem, observed, counted, poses.targets)
-    return Poses(poses.targets, observed, counted, start)
+    return _compared(problem, poses.targets, poses.observed, poses.counted & ~dropped)
+
+
+def _compared(problem, targets, observed, counted) -> Poses:
+    """Return the poses, of which these vertices are compared."""
+    known = np.where(counted[..., None], observed, 0.0).astype(problem.dtype)
+    return Poses(targets, known, counted, _starts(problem, known, counted, targets))
 
 
 def read_poses(

@@ -12,6 +12,7 @@ patterns of little noise, where it extrapolates), clusters and block bootstrap (
 number of observations (covers, and is too wide to be of use).
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -125,6 +126,7 @@ def _spectrum(model: _Normal, found, freedom: int, rest: float, floor: float):
     return spectrum, uncertainty
 
 
+@cache
 def _splines(count: int) -> Float[np.ndarray, "modes splines"]:
     """Return quadratic B-splines at the logarithms of the patterns' numbers."""
     if not count:

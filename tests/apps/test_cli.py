@@ -14,24 +14,7 @@ from PIL import Image
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import parts_by_place, read_pose
-from jaxdeform._apps.cli import main
 from jaxdeform._mesh.files import without_suffix
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Return a function that runs the command line: arguments -> (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["jaxdeform", *map(str, arguments)])
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code
-        return code, *capsys.readouterr()
-
-    return run
 
 
 def lower_and_upper(bar):

@@ -1,7 +1,5 @@
 """The command deform with vertices chosen by expressions: the same as the calls in Python."""
 
-import sys
-
 import jax
 import numpy as np
 import pytest
@@ -9,27 +7,15 @@ from helpers import EXACT
 from PIL import Image
 
 import jaxdeform as jd
-from jaxdeform._apps.cli import main
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def deform(run, monkeypatch, tmp_path):
     """Return a function that runs ``deform`` on a bar 1 high: (exit code, stdout, stderr)."""
     bar = jd.shapes.bar()
     jd.save_mesh(tmp_path / "bar.obj", jd.Mesh(bar.vertices / 151, bar.faces))
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        words = ["jaxdeform", "deform", "bar.obj", "-o", "out.obj", *map(str, arguments)]
-        monkeypatch.setattr(sys, "argv", words)
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code
-        return code, *capsys.readouterr()
-
-    return run
+    return lambda *arguments: run("deform", "bar.obj", "-o", "out.obj", *arguments)
 
 
 ENDS = "--fix", "y<0.1", "--move", "y>0.9"
@@ -51,8 +37,8 @@ def ends(about=None):
     return mesh, handles, targets
 
 
-def test_the_command_of_the_readme(run):
-    code, out, err = run(
+def test_the_command_of_the_readme(deform):
+    code, out, err = deform(
         *TURN, "--stiff", "y>0.5", 30, "--rings", 2, "--method", "material",
         "--picture", "out.png", "--steps", 20,
     )  # fmt: skip
@@ -76,11 +62,11 @@ def test_the_command_of_the_readme(run):
 
 
 @pytest.mark.parametrize("method", ["arap", "rc-arap", "laplacian"])
-def test_other_methods_are_those_of_the_documentation(run, method):
+def test_other_methods_are_those_of_the_documentation(deform, method):
     about = (0.0, 0.5, 0.1)
     own = {"arap": (), "rc-arap": ("--rings", 2), "laplacian": ()}[method]
     steps = () if method == "laplacian" else ("--steps", 20)
-    code, out, err = run(*TURN, "--about", *about, "--method", method, *own, *steps)
+    code, out, err = deform(*TURN, "--about", *about, "--method", method, *own, *steps)
     assert (code, err) == (0, "")
     mesh, handles, targets = ends(about)
     if method == "laplacian":
@@ -95,9 +81,9 @@ def test_other_methods_are_those_of_the_documentation(run, method):
     assert ("energy" in out) == (method != "laplacian")
 
 
-def test_expressions_of_fix_join_and_the_last_stiff_wins(run):
+def test_expressions_of_fix_join_and_the_last_stiff_wins(deform):
     where = "--fix", "y < 0.05", "--fix", "v < 0.1 and x > 0", "--move", "y > 0.9 and z > 0"
-    code, out, err = run(
+    code, out, err = deform(
         *where, "--translate", 0.1, -0.05, 0, "--rigidity", 0.1, "--stiff", "y > 0.3", 2,
         "--stiff", "y > 0.6", 5e-1, "--steps", 1, "-o", "out.ply",
     )  # fmt: skip
@@ -154,10 +140,10 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("message", MISTAKES)
-def test_a_mistake_is_told_before_any_work(run, monkeypatch, message):
+def test_a_mistake_is_told_before_any_work(deform, monkeypatch, message):
     for name in ("precompute", "laplacian_editing"):
         monkeypatch.setattr(jd, name, lambda *_, **__: pytest.fail("began to work"))
-    code, out, err = run(*MISTAKES[message])
+    code, out, err = deform(*MISTAKES[message])
     assert (code, out) == (2, "")
     assert err.startswith(f"jaxdeform: {message}")
     assert err.count("\n") == 1 + 2 * ("^" in message)
@@ -166,20 +152,20 @@ def test_a_mistake_is_told_before_any_work(run, monkeypatch, message):
 @pytest.mark.parametrize(
     "words", [("--method", "cage"), ("--stiff",), ("--rotate", "z"), ("--translate", 0, 1, "up")]
 )
-def test_wrong_usage_names_the_option(run, words):
-    code, out, err = run(*words)
+def test_wrong_usage_names_the_option(deform, words):
+    code, out, err = deform(*words)
     assert (code, out) == (2, "")
     assert f"'{words[0]}'" in err
     assert "Traceback" not in err
 
 
-def test_a_file_and_expressions_count_the_same(run, tmp_path):
+def test_a_file_and_expressions_count_the_same(deform, tmp_path):
     (tmp_path / "h.json").write_text(
         """{"handles": [{"where": "y < 0.1"}, {"where": "y > 0.9", "translation": [0, 0.2, 0]}]}"""
     )
-    _, by_file, _ = run("--handles", "h.json", "--rigidity", 1, "--steps", 1)
+    _, by_file, _ = deform("--handles", "h.json", "--rigidity", 1, "--steps", 1)
     first = jd.load_mesh("out.obj").vertices
-    _, by_place, _ = run(*LIFT, "--rigidity", 1, "--steps", 1)
+    _, by_place, _ = deform(*LIFT, "--rigidity", 1, "--steps", 1)
     counts = "fixed: 97 vertices, moved: 97 vertices"
     assert by_file.split("\n")[0] == by_place.split("\n")[0] == counts
     np.testing.assert_array_equal(jd.load_mesh("out.obj").vertices, first)
