@@ -119,6 +119,12 @@ def check_flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """Raise InputError unless the value is one of these words."""
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(f"{name} is {shown(value)}: give one of {', '.join(map(repr, choices))}")
+
+
 def check_precision(name: str, dtype: np.dtype) -> None:
     """Raise InputError for float64 numbers while JAX is set to float32."""
     if dtype == np.float64 and not jax.config.read("jax_enable_x64"):

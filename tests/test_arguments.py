@@ -253,6 +253,7 @@ def wrong_values(kind: str, good, problem) -> dict:
         "source": lambda: NO_SETTING | {"path": Path("a.obj"), "array": MESH.vertices},
         "axis": lambda: no_arrays(problem) | NO_AXIS,
         "dtype": lambda: NO_SETTING | {"half": np.float16, "integer": int, "name": "north"},
+        "metric": lambda: {"none": None, "list": ["auto"], "word": "A", "array": MESH.vertices},
         "progress": lambda: {"text": "print", "number": 5, "mesh": MESH},
         "label": lambda: {"none": None, "number": 5, "bytes": b"rigidity", "list": ["rigidity"]},
         "titles": lambda: NO_TEXTS,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdeform._checks import check_count, check_flag, check_tolerance
 from jaxdeform._deformation.descent import Anchor, Descent, Solver
+from jaxdeform._deformation.metric import apply_metric, metric_of
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import InputError
@@ -56,8 +57,8 @@ class Implicit:
     """Differentiate the fixed point instead of the path: memory independent of the step count.
 
     The implicit function theorem on grad E(p) = 0 gives ``H dp = -(d grad E / d inputs) dinputs``.
-    The Hessian H = A - K^T dT/dC K is symmetric, so one conjugate gradient method, preconditioned
-    with the factor of A, serves forward and reverse mode.
+    The Hessian H = A - K^T dT/dC K is symmetric, so one conjugate gradient method serves forward
+    and reverse mode. Its preconditioner is the metric of ``QuasiNewton()``.
 
     It is taken one Newton step further than the state, at the minimum, because the error of a
     derivative is that of the state many times over: at the state of ``QuasiNewton()`` itself up to
@@ -125,7 +126,9 @@ class Implicit:
         def minimiser_jvp(primals, tangents):
             system, inputs, *state = primals
             known, _ = minimiser(*primals)  # so that this rule has derivatives too
-            p, transforms = self._newton_step(energy, system, inputs, *state)
+            metric = metric_of(system, energy.local, inputs.rigidity)
+            precondition = lambda x: apply_metric(system, metric, x) + system.held(x)  # noqa: E731
+            p, transforms = self._newton_step(energy, system, inputs, precondition, *state)
             p = p + known - jax.lax.stop_gradient(known)
 
             def gradient(free, inputs):
@@ -134,14 +137,14 @@ class Implicit:
 
             _, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
             _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
-            move = self._solve_hessian(system, hessian, -right)
+            move = self._solve_hessian(system, hessian, precondition, -right)
             move = jnp.where(system.free[None], move, tangents[1].targets)
             moves = move, Anchor(move, jnp.zeros_like(transforms))
             return (p, Anchor(p, transforms)), moves
 
         return minimiser(system, inputs, p, transforms)
 
-    def _newton_step(self, energy: ReducedEnergy, system, inputs, p, transforms):
+    def _newton_step(self, energy: ReducedEnergy, system, inputs, precondition, p, transforms):
         """Return p after one Newton step, and the transformations there (to first order)."""
         system, inputs, p, transforms = jax.lax.stop_gradient((system, inputs, p, transforms))
 
@@ -152,7 +155,7 @@ class Implicit:
         (gradient, _), linear = jax.linearize(evaluate, p)
         step, left = conjugate_gradients(
             lambda x: linear(x)[0] + system.held(x),
-            system.precondition,
+            precondition,
             -gradient,
             _NEWTON_TOLERANCE,
             self.max_steps,
@@ -160,13 +163,13 @@ class Implicit:
         step = jnp.where(left <= _NEWTON_TOLERANCE, step, 0.0)
         return p + step, transforms + linear(step)[1]
 
-    def _solve_hessian(self, system: System, hessian, right):
+    def _solve_hessian(self, system: System, hessian, precondition, right):
         tolerance = max(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
         accepted = max(100.0 * tolerance, 1e-6)
 
         def solve(multiply, b):
             solution, left = conjugate_gradients(
-                multiply, system.precondition, b, tolerance, self.max_steps
+                multiply, precondition, b, tolerance, self.max_steps
             )
             unsolved = ~(left <= accepted)
             if self.throw:

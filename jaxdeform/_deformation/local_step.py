@@ -123,6 +123,10 @@ class _Material:
         """Return Eq. 4.2 of each cell."""
         return cell_energies(t, c, b, rigidity)
 
+    def strain_rigidity(self, rigidity: Scalars) -> Scalars:
+        """Return the lambda of the strain energy: lambda itself."""
+        return rigidity
+
 
 @dataclass(frozen=True)
 class Newton(_Material):
@@ -302,6 +306,10 @@ class AffineFit:
     def energy(self, t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Scalars:
         """Return Eq. 4.2 of each cell without resistance to strain."""
         return cell_energies(t, c, b, jnp.zeros_like(rigidity))
+
+    def strain_rigidity(self, rigidity: Scalars) -> Scalars:
+        """Return the lambda of the strain energy: 0."""
+        return jnp.zeros_like(rigidity)
 
 
 def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:

@@ -53,10 +53,6 @@ class System(eqx.Module):
         """
         return jnp.where(self.free[None], 0.0, x)
 
-    def precondition(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
-        """Return A^-1 x at free vertices, x at others."""
-        return self.factor.solve(x) + self.held(x)
-
 
 class Problem(eqx.Module):
     """A mesh with its cells and handles, factored. Made by :func:`precompute`.

@@ -82,6 +82,26 @@ class EllMatrix(eqx.Module):
         return out.reshape(x.shape)
 
 
+def sparse_blocks(
+    columns: Int[np.ndarray, "slots vertices"],
+    values: Float[np.ndarray, "out 1 slots vertices"],
+    overflow_columns: Int[np.ndarray, "slots overflow"],
+    overflow_values: Float[np.ndarray, "out 1 slots overflow"],
+    overflow_rows: Int[np.ndarray, "overflow"],
+) -> list[sp.csr_matrix]:
+    """Return the blocks of a matrix of one column of blocks, given its arrays in their order."""
+    n, out = columns.shape[1], []
+    rows = np.broadcast_to(np.arange(n), columns.shape)
+    more_rows = np.broadcast_to(overflow_rows, overflow_columns.shape)
+    row = np.concatenate([rows.ravel(), more_rows.ravel()])
+    column = np.concatenate([columns.ravel(), overflow_columns.ravel()])
+    for block, more in zip(values[:, 0], overflow_values[:, 0], strict=True):
+        value = np.concatenate([block.ravel(), more.ravel()])
+        used = value != 0.0
+        out.append(sp.csr_matrix((value[used], (row[used], column[used])), shape=(n, n)))
+    return out
+
+
 def _best_width(length: Int[np.ndarray, "vertices"]) -> int:
     """Return the number of slots that stores least; length counts the entries of each row."""
     widths = np.arange(1, min(WIDEST, max(1, length.max(initial=1))) + 1)

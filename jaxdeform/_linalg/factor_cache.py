@@ -10,6 +10,7 @@ import os
 import threading
 import weakref
 from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
@@ -110,20 +111,36 @@ def cholesky(lower: sp.csc_matrix, dtype: np.dtype, shifts: tuple[float, ...]) -
     )
 
 
-class _Factor(NamedTuple):
+class HostFactor(NamedTuple):
+    """A factor of this process."""
+
     matrix: Matrix
+    """A copy of what was factored."""
     solver: Any
     lock: threading.Lock
     """CHOLMOD's workspace belongs to the factor."""
 
+    @staticmethod
+    def of(matrix: Matrix, dtype: np.dtype, shifts: tuple[float, ...] = SHIFTS) -> "HostFactor":
+        """Factor a matrix. **Raises** NotPositiveDefinite."""
+        solver = cholesky(matrix.inner(), dtype, shifts)
+        return HostFactor(Matrix(*(np.array(x) for x in matrix)), solver, threading.Lock())
+
+    @property
+    def size(self) -> int:
+        """What it takes, in bytes, as estimated."""
+        entries, n = len(self.matrix.rows), len(self.matrix.free)
+        return int(entries * (_FACTOR_BYTES * np.log2(n + 1) + _MATRIX_BYTES))
+
     def solve(self, right: np.ndarray, out: np.ndarray) -> None:
+        """Solve for columns (n, k)."""
         with self.lock:
             self.solver.solve(right, out)
 
 
 class _Entry:
     def __init__(self) -> None:
-        self.factor: Future[_Factor] = Future()
+        self.factor: Future[HostFactor] = Future()
         self.size = 0
         self.left_over = False
 
@@ -148,24 +165,37 @@ class FactorCache:
         matrix: Matrix,
         dtype: np.dtype,
         shifts: tuple[float, ...] = SHIFTS,
-    ) -> _Factor:
-        """Return the factor of a matrix, made where it is missing.
+    ) -> HostFactor:
+        """Return the factor of a matrix, whose hash is the key, made where it is missing.
 
         **Raises** NotPositiveDefinite, and ValueError where key and matrix do not belong together.
         """
+
+        def make() -> HostFactor:
+            if not np.array_equal(matrix.key(), key):
+                raise _mixed_up()
+            return HostFactor.of(matrix, dtype, shifts)
+
+        factor = self.find(key, dtype, make)
+        if not factor.matrix.equals(matrix):
+            raise _mixed_up()
+        return factor
+
+    def find(
+        self, key: UInt32[np.ndarray, "4"], dtype: np.dtype, make: Callable[[], HostFactor]
+    ) -> HostFactor:
+        """Return the factor of this key, made where it is missing."""
         name = key.tobytes(), dtype.char
         with self._lock:
             entry = self._entries.get(name)
             missing = entry is None
             if entry is None:
                 entry = self._entries[name] = _Entry()
+                entry.left_over = key.tobytes() not in self._owners
             self._entries.move_to_end(name)
         if missing:
-            self._make(name, entry, key, matrix, dtype, shifts)
-        factor = entry.factor.result()
-        if not factor.matrix.equals(matrix):
-            raise _mixed_up()
-        return factor
+            self._make(name, entry, make)
+        return entry.factor.result()
 
     def own(self, key: UInt32[np.ndarray, "4"], owner: Array) -> None:
         """Let the factors of this key go some time after the owner is collected."""
@@ -188,23 +218,19 @@ class FactorCache:
         with self._lock:
             self._entries.clear()
 
-    def _make(self, name, entry: _Entry, key, matrix: Matrix, dtype, shifts) -> None:
+    def _make(self, name, entry: _Entry, make: Callable[[], HostFactor]) -> None:
         try:
-            if not np.array_equal(matrix.key(), key):
-                raise _mixed_up()
-            solver = cholesky(matrix.inner(), dtype, shifts)
-            copy = Matrix(*(np.array(x) for x in matrix))
+            factor = make()
         except BaseException as error:
             with self._lock:
                 self._entries.pop(name, None)
             entry.factor.set_exception(error)
             raise
-        entries, n = len(copy.rows), len(copy.free)
         with self._lock:
-            entry.size = int(entries * (_FACTOR_BYTES * np.log2(n + 1) + _MATRIX_BYTES))
+            entry.size = factor.size
             if name in self._entries:
                 self._free_some(name)
-        entry.factor.set_result(_Factor(copy, solver, threading.Lock()))
+        entry.factor.set_result(factor)
 
     def _of(self, key: bytes) -> list[_Entry]:
         return [self._entries[key, c] for c in "fd" if (key, c) in self._entries]

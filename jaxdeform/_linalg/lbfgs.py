@@ -1,7 +1,7 @@
 """Preconditioned L-BFGS for one minimisation or a queue of them.
 
 This is the engine behind :class:`QuasiNewton`. All it knows about meshes is that positions are
-(3, vertices) and that A^-1 serves as the preconditioner.
+(3, vertices).
 
 Under vmap, the general rule for loops would run every member of the batch until the slowest is
 done, and select between old and new values of everything in every iteration. For 64 bars, of which
@@ -53,6 +53,18 @@ class Sample(NamedTuple):
     """Two energies that differ by less than this differ only by rounding."""
 
 
+class Function(NamedTuple):
+    """What is minimised, for a batch of members."""
+
+    evaluate: Callable[[Any, Any, Array], Sample]
+    """Of (system, inputs, p); the members are the last axis of inputs, p and the result."""
+    metric: Callable[[Any, Any, Array, Array], Array]
+    """Of (system, inputs, gradient, plain); the members are the first axis of all but the system.
+
+    Returns H^-1 gradient, H an approximation of the Hessian. Where ``plain``, H is so large that
+    the step cannot raise the function."""
+
+
 class Minimum(NamedTuple):
     """Where a minimisation ended."""
 
@@ -74,21 +86,17 @@ def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."
 
 
 def minimize(
-    evaluate: Callable[[Any, Any, Array], Sample],
+    function: "Function",
     system: Any,
     inputs: Any,
     start: Float[Array, "3 vertices"],
     settings: Settings,
 ) -> Minimum:
-    """Minimise from a start. Under vmap over ``inputs`` and ``start``, run the batch as a queue.
-
-    ``evaluate(system, inputs, p)`` evaluates a batch, which is the last axis of ``inputs``, ``p``
-    and the result. ``system.factor.solve`` applies A^-1.
-    """
+    """Minimise from a start. Under vmap over ``inputs`` and ``start``, run the batch as a queue."""
 
     @custom_vmap
     def batch(system, inputs, start):
-        return _run_queue(evaluate, system, inputs, start, settings)
+        return _run_queue(function, system, inputs, start, settings)
 
     @batch.def_vmap
     def larger_batch(size, is_batched, system, *own):
@@ -135,18 +143,22 @@ class _Slots(NamedTuple):
     p: Float[Array, "slots 3 vertices"]
     at: Sample
     z: Float[Array, "slots 3 vertices"]
-    """A^-1 gradient: minus the plain step."""
+    """H^-1 gradient."""
+    back: Float[Array, "slots 3 vertices"]
+    """Minus the step without memory: z, or where the last step was refused, that of ``plain``."""
     gain: Float[Array, "slots"]
-    """<gradient, z>: twice the expected gain of a plain step."""
+    """<gradient, z>: twice the expected gain of the step -z."""
     iteration: Int[Array, "slots"]
     """Number of evaluations so far."""
     history: Float[Array, "slots history"]
     memory: _Memory
+    refused: Bool[Array, "slots"]
+    """True where the last step was refused."""
     stalled: Bool[Array, "slots"]
     """True where two steps in a row were refused."""
 
 
-def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
+def _run_queue(function, system, inputs, start, settings: Settings) -> Minimum:
     count = start.shape[0]
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
     slots = min(count, most)
@@ -166,8 +178,8 @@ def _run_queue(evaluate, system, inputs, start, settings: Settings) -> Minimum:
     def finish_some(state):
         """Iterate until a member is done; store its result and start the next one."""
         tick, member, following, work, out = state
-        own = jax.tree.map(lambda x: jnp.moveaxis(x.at[member].get(mode="clip"), 0, -1), inputs)
-        advance = partial(_advance, evaluate, system, own, settings)
+        own = jax.tree.map(lambda x: x.at[member].get(mode="clip"), inputs)
+        advance = partial(_advance, function, system, own, settings)
         idle = member >= count
         tick, work = jax.lax.while_loop(
             lambda s: ~jnp.any(_done(s[1], settings) & ~idle), lambda s: advance(*s), (tick, work)
@@ -197,7 +209,8 @@ def _empty(p: Float[Array, "slots 3 vertices"], settings: Settings) -> _Slots:
         zeros(m, *shape), zeros(m, *shape), filled, zeros(*small), zeros(*small), zeros(m), zeros(m)
     )
     iteration, history = jnp.zeros(w, jnp.int32), zeros(settings.max_steps + 1)
-    return _Slots(p, at, zeros(*shape), zeros(), iteration, history, memory, jnp.zeros(w, bool))
+    z, no = zeros(*shape), jnp.zeros(w, bool)
+    return _Slots(p, at, z, z, zeros(), iteration, history, memory, no, no)
 
 
 def _restart(
@@ -208,9 +221,11 @@ def _restart(
     return work._replace(
         p=jnp.where(wide, p, work.p),
         z=jnp.where(wide, 0.0, work.z),
+        back=jnp.where(wide, 0.0, work.back),
         at=work.at._replace(energy=jnp.where(which, jnp.inf, work.at.energy)),
         iteration=jnp.where(which, 0, work.iteration),
         memory=work.memory._replace(filled=work.memory.filled & ~which[:, None]),
+        refused=work.refused & ~which,
         stalled=work.stalled & ~which,
     )
 
@@ -224,39 +239,40 @@ def _done(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
     return (work.iteration > 0) & ~(running & jnp.isfinite(work.at.energy))
 
 
-def _advance(evaluate, system, inputs, settings: Settings, tick, work: _Slots):
-    step = _direction(work.memory, work.z, tick)
+def _advance(function: Function, system, inputs, settings: Settings, tick, work: _Slots):
+    step = _direction(work.memory, work.back, tick)
     # The first iteration evaluates the start: its step is zero and its old energy infinite. (The
     # local step is thus compiled only once.) A member that is done waits.
     step = jnp.where(_done(work, settings)[:, None, None], 0.0, step)
     p = work.p + step
-    new = without_fusion(
-        tick >= 0, work.at, partial(evaluate, system), inputs, jnp.moveaxis(p, 0, -1)
-    )
+    last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (inputs, p))
+    new = without_fusion(tick >= 0, work.at, partial(function.evaluate, system), *last)
+    first = work.iteration == 0
+    # Where even a step of ``plain`` ends in NaN there is no way on: it is kept, which ends the
+    # member.
+    lost = work.refused & jnp.isnan(new.energy)
+    good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
+    keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
     right = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 0)
     g = right[:, 1]
-    z = system.factor.solve(g)
-    dz = z - work.z
+    # After a refused step the way on is a step of ``plain`` from the old place.
+    back = jnp.where(good[:, None, None], g, jnp.moveaxis(work.at.gradient, -1, 0))
+    back = function.metric(system, inputs, back, ~good)
+    dz = back - work.z
     # All inner products of the iteration except those with the memory, as one batched product.
-    left = jnp.stack([step, dz, z], axis=1)
+    left = jnp.stack([step, dz, back], axis=1)
     products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
-    first = work.iteration == 0
-    plain = ~jnp.any(work.memory.filled, axis=1)
-    # Where even a plain step ends in NaN there is no way on: it is kept, which ends the member.
-    lost = plain & jnp.isnan(new.energy)
-    good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
-    # A refused step costs its evaluation and clears the memory. The plain step that follows cannot
-    # raise the energy, so a second refusal in a row is due to rounding.
-    stalled = work.stalled | (~good & plain)
+    # A refused step costs its evaluation and clears the memory. The step of ``plain`` that follows
+    # cannot raise the energy, so a second refusal in a row is due to rounding.
+    stalled = work.stalled | (~good & work.refused)
     memory = _remember(work.memory, tick, good & ~first, good, step, dz, g, products)
-    keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
     at = jax.tree.map(keep, new, work.at)
     slot = jnp.arange(p.shape[0], dtype=jnp.int32)
     history = work.history.at[slot, work.iteration].set(at.energy, mode="drop")
     wide = good[:, None, None]
-    p, z = jnp.where(wide, p, work.p), jnp.where(wide, z, work.z)
-    gain = keep(products[:, 2, 1], work.gain)
-    return tick + 1, _Slots(p, at, z, gain, work.iteration + 1, history, memory, stalled)
+    p, z = jnp.where(wide, p, work.p), jnp.where(wide, back, work.z)
+    gain, count = keep(products[:, 2, 1], work.gain), work.iteration + 1
+    return tick + 1, _Slots(p, at, z, back, gain, count, history, memory, ~good, stalled)
 
 
 def _direction(memory: _Memory, z, tick) -> Float[Array, "slots 3 vertices"]:
