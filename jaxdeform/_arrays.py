@@ -1,7 +1,7 @@
 """Read arrays, or raise an InputError that names the argument, the reason, and the next move.
 
-All arrays of all public functions come in here: as NumPy's by :func:`read_numbers`, or also as
-JAX's by :func:`read_array`. So all of them refuse the same things.
+All arrays of all public functions come in here: as NumPy's by `read_numbers`, or also as
+JAX's by `read_array`. So all of them refuse the same things.
 """
 
 from typing import Any

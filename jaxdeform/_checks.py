@@ -147,7 +147,7 @@ def check_positions(
 def read_positions(
     name: str, value: ArrayLike, shape: tuple, dtype: np.dtype, unit: str = "vertex"
 ) -> Array | np.ndarray:
-    """Like :func:`check_positions`, but without moving NumPy arrays to the device."""
+    """Like `check_positions`, but without moving NumPy arrays to the device."""
     array = read_array(value, dtype, name)
     if array.shape != shape:
         raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
@@ -162,7 +162,7 @@ def read_positions(
 def read_host_positions(
     name: str, value: ArrayLike, shape: tuple, unit: str = "vertex"
 ) -> np.ndarray:
-    """Like :func:`read_positions`, for code that NumPy runs, in float64."""
+    """Like `read_positions`, for code that NumPy runs, in float64."""
     given = read_host_array(value, np.float64, name)
     return np.asarray(read_positions(name, given, shape, given.dtype, unit))
 
@@ -175,7 +175,7 @@ def rows_of_three(
 
 
 def host_rows_of_three(name: str, value: ArrayLike) -> Float[np.ndarray, "rows 3"]:
-    """Like :func:`rows_of_three`, for code that NumPy runs, in float64."""
+    """Like `rows_of_three`, for code that NumPy runs, in float64."""
     return np.asarray(_read_rows(name, read_host_array(value, np.float64, name), "vertex"))
 
 

@@ -15,7 +15,7 @@ from jaxdeform._mesh.select import some_where
 from jaxdeform._mesh.words import real
 
 MEDIUM = 0.2
-"""A material between rubber and steel, for :func:`jaxdeform.rigidity_from_material`."""
+"""A material between rubber and steel, for `rigidity_from_material`."""
 
 
 def read_pose(path: Path, rest: jd.Mesh, name: Path) -> np.ndarray:

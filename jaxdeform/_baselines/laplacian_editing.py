@@ -75,7 +75,7 @@ def laplacian_editor(
       2004): details rotate with it, up to about 90 degrees. All coordinates are then solved for at
       once.
 
-    **Returns** a :class:`LaplacianEditor`.
+    **Returns** a `LaplacianEditor`.
 
     **Raises** InputError: no handles; a handle out of range or repeated; a connected component
     without a handle; weights of the wrong shape or not finite; handles that do not determine the
@@ -138,11 +138,11 @@ def laplacian_editing(
     - mesh: the rest shape.
     - handles: (handles,), vertex indices, a mask or a selection.
     - targets: (handles, 3), in the unit of the mesh.
-    - weights, handle_weights, similarity: as in :func:`laplacian_editor`.
+    - weights, handle_weights, similarity: as in `laplacian_editor`.
 
     **Returns** the positions (vertices, 3).
 
-    **Raises** InputError as :func:`laplacian_editor`; also for targets that are not finite or of
+    **Raises** InputError as `laplacian_editor`; also for targets that are not finite or of
     the wrong shape.
 
     Example:

@@ -14,7 +14,7 @@ from jaxdeform._mesh.words import real, whole
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Joints and the bones between them; made by :func:`load_skeleton`."""
+    """Joints and the bones between them; made by `load_skeleton`."""
 
     joints: Float[np.ndarray, "joints 3"]
     """Positions, in the unit of the file."""
@@ -40,7 +40,7 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
 
     **Arguments**: path of a ``.tgf`` file.
 
-    **Returns** a :class:`Skeleton` with all joints, and with the edges that are bones.
+    **Returns** a `Skeleton` with all joints, and with the edges that are bones.
 
     **Raises** InputError naming the file and the line; also for a bone of length zero and a file
     without bones.

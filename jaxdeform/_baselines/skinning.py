@@ -55,7 +55,7 @@ def linear_blend_skinning(
     """Return ``p'_i = sum_j w_ij T_j p_i`` (thesis chapter 3).
 
     Affine transformations are blended as matrices, so the blend of two rotations shrinks: a twist
-    of 180 degrees collapses the middle. :func:`dual_quaternion_skinning` does not shrink. This is a
+    of 180 degrees collapses the middle. `dual_quaternion_skinning` does not shrink. This is a
     pure function of arrays: use jit, vmap over poses, and grad or jvp in all arguments.
 
     **Arguments**
@@ -90,7 +90,7 @@ def dual_quaternion_skinning(
     of opposite sign. For each vertex, the one nearer to the control of largest weight is used,
     which takes the shorter way round. If two controls differ by exactly 180 degrees, neither way is
     shorter, and the result jumps there; everywhere else it is smooth. Use it with jit, vmap, grad
-    and jvp, like :func:`linear_blend_skinning`.
+    and jvp, like `linear_blend_skinning`.
 
     Kavan, Collins, Zara and O'Sullivan, "Geometric skinning with approximate dual quaternion
     blending" (2008), doi:10.1145/1409625.1409627.
@@ -103,7 +103,7 @@ def dual_quaternion_skinning(
 
     **Returns** (vertices, 3).
 
-    **Raises** InputError as :func:`linear_blend_skinning`; also for a negative weight and a matrix
+    **Raises** InputError as `linear_blend_skinning`; also for a negative weight and a matrix
     that is not a rotation.
 
     Example:

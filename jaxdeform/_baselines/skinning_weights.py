@@ -26,11 +26,11 @@ def rigid_weights(
 
     If several controls are equally near, the first gets all the weight, so each row sums to one.
 
-    **Arguments**: vertices, controls and distances as in :func:`inverse_distance_weights`.
+    **Arguments**: vertices, controls and distances as in `inverse_distance_weights`.
 
     **Returns** (vertices, controls) weights.
 
-    **Raises** InputError as :func:`inverse_distance_weights`.
+    **Raises** InputError as `inverse_distance_weights`.
 
     Example:
         >>> import jaxdeform as jd
@@ -58,9 +58,9 @@ def inverse_distance_weights(
     - vertices: (vertices, 3).
     - controls: points (controls, 3), or bones (controls, 2, 3), whose distance is that of the
       segment.
-    - power: a number above 0. A larger power gives weights closer to :func:`rigid_weights`.
+    - power: a number above 0. A larger power gives weights closer to `rigid_weights`.
     - distances: (vertices, controls), used instead of Euclidean distances; for instance from
-      :func:`geodesic_distances`.
+      `geodesic_distances`.
 
     **Returns** (vertices, controls) weights.
 

@@ -117,7 +117,7 @@ def _cotangents(rest: Float[Array, "3 vertices"], graph: Graph) -> Float[Array, 
 
 
 class GeometryMaps(NamedTuple):
-    """K, its transpose and A at a geometry: stands in for a :class:`System` in an evaluation."""
+    """K, its transpose and A at a geometry: stands in for a `System` in an evaluation."""
 
     system: System
     geometry: Geometry

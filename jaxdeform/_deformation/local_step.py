@@ -285,7 +285,7 @@ class AffineFit:
     """The best linear map, with no resistance to strain (Eq. 4.6): the limit lambda -> 0.
 
     In directions in which the cell has no extent (the normal of a flat one) any map fits; there
-    it is the rotation of :class:`RotationFit`.
+    it is the rotation of `RotationFit`.
     """
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:

@@ -55,7 +55,7 @@ class System(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A mesh with its cells and handles, factored. Made by :func:`precompute`.
+    """A mesh with its cells and handles, factored. Made by `precompute`.
 
     A problem is a value: a pytree of arrays that can be copied, pickled, written to a file with
     ``equinox.tree_serialise_leaves``, returned from a jitted function or sent to another process.
@@ -67,7 +67,7 @@ class Problem(eqx.Module):
     handles: Int[np.ndarray | Array, "handles"]
     """Indices of the handle vertices, in the order of the targets' rows."""
     cells: Cells = eqx.field(static=True)
-    """The cells (:func:`rings` with r = 1 by default), with the weights that are computed with."""
+    """The cells (`rings` with r = 1 by default), with the weights that are computed with."""
 
     @property
     def mesh(self) -> Mesh:

@@ -44,7 +44,7 @@ class Solution(eqx.Module):
     steps: Int[Array, "*batch"]
     """Iterations done."""
     result: Result
-    """What happened: a member of :class:`Result`."""
+    """What happened: a member of `Result`."""
     flipped: Int[Array, "*batch"]
     """Number of cells that are inside out (det T <= 0): a part of the mesh is its mirror image."""
 
@@ -93,19 +93,19 @@ def deform(
 
     **Arguments**
 
-    - problem: from :func:`precompute`.
+    - problem: from `precompute`.
     - targets: (handles, 3) positions of the handles, in the order of ``problem.handles``.
     - rigidity: lambda >= 0, a number or one per vertex (vertices,). Its unit is length squared:
-      small is rubber, large is steel. :func:`rigidity_from_material` makes it from a scale-free
+      small is rubber, large is steel. `rigidity_from_material` makes it from a scale-free
       constant.
     - local: solver of the local step. ``Newton()`` is the default; ``LBFGS()`` and
       ``GradientDescent()`` find the same minimum. ``RotationFit()`` makes it ARAP, ``AffineFit()``
-      drops the resistance to strain. Any :class:`LocalStep` will do.
+      drops the resistance to strain. Any `LocalStep` will do.
     - solver: ``QuasiNewton()`` (default: to convergence) or ``Alternating(steps=100)`` (as in the
       thesis; the default with normals).
     - start: (vertices, 3) first guess; by default Laplacian editing (Sec. 4.1.2).
-    - handle_weights: other weights of the soft handles than in :func:`precompute`, one or
-      (handles,), from 0 to those of :func:`precompute` (whose factor stays, and bounds the energy
+    - handle_weights: other weights of the soft handles than in `precompute`, one or
+      (handles,), from 0 to those of `precompute` (whose factor stays, and bounds the energy
       from above). Entries of hard handles are not read. Differentiable.
     - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
@@ -117,7 +117,7 @@ def deform(
     - throw: raise an error if the result is not ``ok``, also inside jit. By default numerical
       trouble comes back in ``result``, because one bad member of a batch must not end the others.
 
-    **Returns** a :class:`Solution`. Numerical trouble comes back in its ``result``.
+    **Returns** a `Solution`. Numerical trouble comes back in its ``result``.
 
     **Raises** InputError: targets or start of the wrong shape or not finite; rigidity negative,
     not finite or of the wrong length; settings that exclude each other. Shapes are checked always,

@@ -59,7 +59,7 @@ _NORMAL_95 = 1.959964
 
 @dataclass(frozen=True, eq=False)
 class FieldEstimate:
-    """A rigidity per vertex, as :func:`estimate_rigidity_field` finds it.
+    """A rigidity per vertex, as `estimate_rigidity_field` finds it.
 
     - field: (vertices,) the rigidity of each vertex; its unit is length squared.
     - interval: (vertices, 2) 95 % interval of each, under the prior.
@@ -71,7 +71,7 @@ class FieldEstimate:
     - misfit: root mean square of the differences between fitted and observed coordinates (a
       length).
     - history: (evaluations,) misfit of each evaluation, accepted or not.
-    - result: how the search ended, a member of :class:`Result`.
+    - result: how the search ended, a member of `Result`.
     """
 
     field: Float[np.ndarray, "vertices"]
@@ -115,16 +115,16 @@ def estimate_rigidity_field(
     **Arguments**
 
     - problem, observed, targets, mask, solver, adjoint, max_evaluations, progress: as
-      :func:`estimate_rigidity`.
+      `estimate_rigidity`.
     - smoothness: weight of the prior. Left out, it is the one under which the poses are most
       probable (marginal likelihood): ``(noise / (diagonal * slope))^2``, with the standard
       deviation of the noise of a coordinate and of the difference of log rigidity between
       neighbors. More smooths.
     - start: a number or (n,); a medium material if left out.
 
-    **Returns** a :class:`FieldEstimate`. Its interval takes targets as exact.
+    **Returns** a `FieldEstimate`. Its interval takes targets as exact.
 
-    **Raises** InputError as :func:`estimate_rigidity`; smoothness not above 0.
+    **Raises** InputError as `estimate_rigidity`; smoothness not above 0.
 
     Example:
         >>> import jaxdeform as jd

@@ -43,15 +43,15 @@ class Estimate:
     """Rigidity as observed poses tell it, with what they do not tell.
 
     - rigidity: (parts,) best value of each part; its unit is length squared.
-    - material: (parts,) the same as a scale-free constant (:func:`rigidity_from_material`).
+    - material: (parts,) the same as a scale-free constant (`rigidity_from_material`).
     - interval: (parts, 2) 95 % interval of the rigidity of each part. It starts at 0 where the part
       may be arbitrarily soft, and ends at infinity where it may be arbitrarily stiff.
-    - verdict: a :class:`Verdict` of each part, which follows from its interval.
+    - verdict: a `Verdict` of each part, which follows from its interval.
     - displacement: (parts, 2) how far a compared vertex moves at most (a length) if the part
       becomes perfectly soft, or perfectly stiff. Where that is too little to see, the value hardly
       matters, however well it is known.
-    - discrepancy: what the model leaves unexplained, a :class:`Discrepancy`.
-    - field: (vertices,) the rigidity of each vertex, as :func:`deform` takes it.
+    - discrepancy: what the model leaves unexplained, a `Discrepancy`.
+    - field: (vertices,) the rigidity of each vertex, as `deform` takes it.
     - vertices: (poses, vertices, 3) the fitted poses.
     - misfit: root mean square of the differences between fitted and observed coordinates (a
       length).
@@ -61,7 +61,7 @@ class Estimate:
     - outliers: (poses, vertices) True where a vertex was left out, because it was seen far from
       where its neighbors say.
     - history: (evaluations,) misfit of each evaluation, accepted or not.
-    - result: how the search ended, a member of :class:`Result`.
+    - result: how the search ended, a member of `Result`.
     """
 
     rigidity: Float[np.ndarray, "parts"]
@@ -139,9 +139,9 @@ def estimate_rigidity(
 
     Minimises ``sum |deform(rigidity) - observed|^2`` over the vertices that are free and seen, by
     Gauss-Newton on log rigidity within bounds and a trust region. (Algorithm 1 of the thesis, which
-    takes the largest of the estimates of single poses, is :func:`estimate_rigidity_thesis`.)
+    takes the largest of the estimates of single poses, is `estimate_rigidity_thesis`.)
 
-    Poses are taken for equilibria, as :func:`deform` makes them, whatever made them and in whatever
+    Poses are taken for equilibria, as `deform` makes them, whatever made them and in whatever
     frame. Where several exist, it is the one next to the observed pose.
 
     The intervals hold where the model is a little wrong: the variance of the residual is measured
@@ -152,7 +152,7 @@ def estimate_rigidity(
 
     **Arguments**
 
-    - problem: the rest shape with its handles; :func:`find_handles` finds them if need be.
+    - problem: the rest shape with its handles; `find_handles` finds them if need be.
     - observed: (n, 3) or (poses, n, 3) positions.
     - parts: (n,) the part of each vertex, 0 to p - 1; one part by default. A mask or a selection
       makes two: its vertices are part 1, all others part 0.
@@ -164,14 +164,14 @@ def estimate_rigidity(
     - mask: (n,) or (poses, n), False where a vertex was not seen; its position is not read. Or a
       selection of the vertices that were seen.
     - start: first guess, a number or (parts,); a medium material by default.
-    - solver, adjoint: as in :func:`deform`. Poses that were made by 100 steps of the thesis's
+    - solver, adjoint: as in `deform`. Poses that were made by 100 steps of the thesis's
       iteration are no equilibria: fit those with ``Alternating(steps=100)``.
     - determined_within: a side of an interval is open if its end is more than this factor from the
       best value (for the verdict).
     - max_evaluations: limit of the search; intervals need more evaluations.
     - progress: called after each evaluation with its number, its misfit and the rigidities.
 
-    **Returns** an :class:`Estimate`; its ``explain()`` says it in words.
+    **Returns** an `Estimate`; its ``explain()`` says it in words.
 
     **Raises** InputError: shapes that do not fit; positions that are seen and not finite; a pose in
     another unit, mirrored, or in another frame than its targets; a handle that was not seen,

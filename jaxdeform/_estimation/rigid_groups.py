@@ -34,7 +34,7 @@ class RigidGroup(NamedTuple):
 def find_handles(
     mesh: Mesh, deformed: ArrayLike, *, tolerance: float = 1e-6
 ) -> Int[np.ndarray, "handles"]:
-    """Find the handles: the vertices of all groups of :func:`find_handle_groups`.
+    """Find the handles: the vertices of all groups of `find_handle_groups`.
 
     **Arguments, Raises**: as there. **Returns** their indices, ascending.
 

@@ -38,7 +38,7 @@ def _advance(solver: BoundedGaussNewton, point, evaluation: Evaluation, state):
 
 @runtime_checkable
 class Evaluated(Protocol):
-    """What a search evaluates: anything that carries an :class:`Evaluation`."""
+    """What a search evaluates: anything that carries an `Evaluation`."""
 
     @property
     def evaluation(self) -> Evaluation:

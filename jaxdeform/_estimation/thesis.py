@@ -17,7 +17,7 @@ from jaxdeform._result import Result
 
 
 class ThesisEstimate(NamedTuple):
-    """What :func:`estimate_rigidity_thesis` returns."""
+    """What `estimate_rigidity_thesis` returns."""
 
     rigidity: float
     path: Float[np.ndarray, "evaluations"]
@@ -44,9 +44,9 @@ def estimate_rigidity_thesis(
     ``threshold``. It can only increase rigidity. It stops when a step is small compared to
     rigidity, whether the misfit is small or not. The thesis names neither step size nor threshold.
 
-    **Arguments**: as :func:`estimate_rigidity`; step_size (length), threshold and start as above.
+    **Arguments**: as `estimate_rigidity`; step_size (length), threshold and start as above.
 
-    **Returns** a :class:`ThesisEstimate`. **Raises** InputError as there.
+    **Returns** a `ThesisEstimate`. **Raises** InputError as there.
 
     Example:
         >>> import jaxdeform as jd

@@ -49,7 +49,7 @@ def load_handles(
     - mesh: its rest positions are what the motions apply to.
     - motion: the ``.def`` file; by default the one with the name of the ``.sel`` file.
 
-    **Returns** a :class:`HandleFile`: handles (handles,) and targets (handles, 3).
+    **Returns** a `HandleFile`: handles (handles,) and targets (handles, 3).
 
     **Raises** InputError naming the file, and the group or vertex.
 

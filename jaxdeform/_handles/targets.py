@@ -86,7 +86,7 @@ def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLik
 
     **Returns** (points, 3), a jax.Array if points or degrees is one, else a NumPy array.
 
-    **Raises** InputError: as for :func:`rotate`.
+    **Raises** InputError: as for `rotate`.
 
     Example:
         >>> import jaxdeform as jd
@@ -117,7 +117,7 @@ def bend(
 
     **Returns** (points, 3), a jax.Array if points or degrees is one, else a NumPy array.
 
-    **Raises** InputError: along and toward are parallel; else as for :func:`rotate`.
+    **Raises** InputError: along and toward are parallel; else as for `rotate`.
 
     Example:
         >>> import jaxdeform as jd

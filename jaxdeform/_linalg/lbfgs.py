@@ -1,6 +1,6 @@
 """Preconditioned L-BFGS for one minimisation or a queue of them.
 
-This is the engine behind :class:`QuasiNewton`. All it knows about meshes is that positions are
+This is the engine behind `QuasiNewton`. All it knows about meshes is that positions are
 (3, vertices).
 
 Under vmap, the general rule for loops would run every member of the batch until the slowest is
@@ -35,7 +35,7 @@ VERTICES_AT_ONCE = 1 << 22
 
 
 class Settings(NamedTuple):
-    """When to stop, and how many steps to remember; see :class:`QuasiNewton`."""
+    """When to stop, and how many steps to remember; see `QuasiNewton`."""
 
     tolerance: float
     max_steps: int

@@ -8,9 +8,8 @@ weight rewards a stretch of its edge. This is the policy for negative weights:
 - In every cell whose energy has no lower bound they count as 0 (``precompute``, with a warning
   that names the cells). Raising a weight raises the energy, so this harms no other cell.
 - Where A is singular even so, ``precompute`` replaces all weights by
-  :func:`~jaxdeform._mesh.laplacian.lifted_weights`, with a warning. The smoothness prior of
-  estimation always uses lifted weights: with a negative weight it would reward a difference across
-  the edge.
+  `lifted_weights`, with a warning. The smoothness prior of estimation always uses lifted weights:
+  with a negative weight it would reward a difference across the edge.
 
 Without a lower bound are, with rings of r = 1, 27 of 502 cells of a decimated knight, 132 of 2,046
 of a finger, 33 of 10,173 of an octopus, none of five other real meshes; with spokes nearly every

@@ -18,7 +18,7 @@ from jaxdeform._mesh.mesh import Mesh, content_digest
 class Cells:
     """One cell per vertex: the edges that the transformation of this vertex has to fit.
 
-    Made by :func:`rings` and :func:`spokes`. Like the mesh, cells are a value: equal content makes
+    Made by `rings` and `spokes`. Like the mesh, cells are a value: equal content makes
     them equal, in every process.
     """
 
@@ -78,7 +78,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     """Return the r-ring cells: ``E(k, r)`` holds the edges with both ends within r steps of k.
 
     A cell with ``r = 1`` includes the edges of its rim, so it is not the neighbourhood of ARAP; see
-    :func:`spokes` for that. Thesis Sec. 2.3, after Chen, Gao, Lai and Xia, "Rigidity controllable
+    `spokes` for that. Thesis Sec. 2.3, after Chen, Gao, Lai and Xia, "Rigidity controllable
     as-rigid-as-possible shape deformation" (2017).
 
     **Arguments**
@@ -87,9 +87,9 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     - r: an integer >= 1, or one per vertex, (vertices,).
     - weights: (edges,), one finite weight per row of ``mesh.edges``. By default, cotangent weights.
       Negative ones (obtuse angles) count as 0 in the few cells whose energy they leave without a
-      lower bound; :func:`precompute` names those.
+      lower bound; `precompute` names those.
 
-    **Returns** :class:`Cells`.
+    **Returns** `Cells`.
 
     **Raises** InputError: r is below 1, not an integer, or of the wrong length; the weights are not
     finite or of the wrong length.
@@ -142,10 +142,10 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
     **Arguments**
 
     - mesh: the rest shape.
-    - weights: (edges,), as in :func:`rings`. A negative weight leaves nearly every star without a
+    - weights: (edges,), as in `rings`. A negative weight leaves nearly every star without a
       lower bound. So, as in CGAL and unlike in libigl, negative weights count as 0 with spokes.
 
-    **Returns** :class:`Cells`.
+    **Returns** `Cells`.
 
     **Raises** InputError: the weights are not finite or of the wrong length.
 

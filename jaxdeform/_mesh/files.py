@@ -31,20 +31,20 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
     Polygons with more than three corners are cut into triangles for the work: a quad along its
     shorter diagonal, any other with short diagonals that stay inside; one that is not planar, as
-    its shadow in its mean plane. The mesh remembers its file (:attr:`Mesh.source`), so that
-    :func:`save_mesh` writes the polygons, and all else that the file held, as they were.
+    its shadow in its mean plane. The mesh remembers its file (`Mesh.source`), so that
+    `save_mesh` writes the polygons, and all else that the file held, as they were.
 
     STL stores no shared vertices, so corners that are exactly equal are merged. A file that holds
-    less than it announces is refused; bytes behind its end are not (:func:`inspect` tells of
-    them). An OBJ announces nothing unless :func:`save_mesh` or MeshLab wrote it. Memory and time
+    less than it announces is refused; bytes behind its end are not (`inspect` tells of
+    them). An OBJ announces nothing unless `save_mesh` or MeshLab wrote it. Memory and time
     are in proportion to the size of the file.
 
     **Arguments**: path, whose suffix names the format. Behind it may stand ``.gz``.
 
-    **Returns** the :class:`Mesh`, in the unit of the file.
+    **Returns** the `Mesh`, in the unit of the file.
 
     **Raises** InputError: the file is missing, empty, truncated, unreadable or of another kind (a
-    pipe or a device, a point cloud), or its content is not a valid :class:`Mesh`.
+    pipe or a device, a point cloud), or its content is not a valid `Mesh`.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -72,7 +72,7 @@ def save_mesh(
 
     With ``.gz`` behind the suffix the file is compressed.
 
-    A mesh that :func:`load_mesh` read is written in the format of its file as that file with other
+    A mesh that `load_mesh` read is written in the format of its file as that file with other
     positions: polygons, texture coordinates, colours, groups, materials, values per face and
     comments stay, and normals are computed anew. Without a change it is the same file, byte for
     byte. In another format the polygons stay. For a plain file, write ``jd.Mesh(mesh.vertices,
@@ -156,7 +156,7 @@ def _content(
 
 
 def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
-    """Read the rigidity per vertex from a PLY file that :func:`save_mesh` wrote.
+    """Read the rigidity per vertex from a PLY file that `save_mesh` wrote.
 
     **Arguments**: path of a ``.ply`` file.
 

@@ -40,7 +40,7 @@ def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike, Source | None]:
 def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
     """Merge equal vertices; drop degenerate faces, repeated faces and unreferenced vertices.
 
-    **Arguments**: mesh, a :class:`Mesh`, a pair (vertices, faces), or the path of a file.
+    **Arguments**: mesh, a `Mesh`, a pair (vertices, faces), or the path of a file.
 
     **Returns** the new mesh and, for each old vertex, its new index, or -1 if it was dropped.
 
@@ -70,7 +70,7 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What :func:`inspect` found; ``str()`` turns it into a report."""
+    """What `inspect` found; ``str()`` turns it into a report."""
 
     counts: dict[str, int | float]
     """Sizes and measures by name: lengths in the unit of the mesh, angles in degrees."""
@@ -89,9 +89,9 @@ class Inspection:
 def inspect(mesh: MeshLike) -> Inspection:
     """Report what is wrong or unusual with a mesh, even if it is broken.
 
-    **Arguments**: mesh, a :class:`Mesh`, a pair (vertices, faces), or the path of a file.
+    **Arguments**: mesh, a `Mesh`, a pair (vertices, faces), or the path of a file.
 
-    **Returns** an :class:`Inspection`.
+    **Returns** an `Inspection`.
 
     **Raises** InputError only if the argument is none of these or the file cannot be read.
 

@@ -22,8 +22,8 @@ def cotangent_weights(mesh: Mesh) -> Float[np.ndarray, "edges"]:
 
     A weight is negative where the angles sum to more than 180 degrees. Such weights are kept
     wherever the energy of every cell has a lower bound with them; elsewhere they count as 0, and
-    :func:`precompute` warns. To have none from the start, pass ``np.maximum(w, 1e-6)`` to
-    :func:`rings` or :func:`spokes`.
+    `precompute` warns. To have none from the start, pass ``np.maximum(w, 1e-6)`` to
+    `rings` or `spokes`.
 
     **Arguments**: mesh.
 

@@ -26,7 +26,7 @@ class Mesh:
     """A triangle mesh, checked once when it is made, then frozen.
 
     Open borders, several connected components, unreferenced vertices, non-manifold edges and
-    vertices, inward-facing faces, and faces without area are all allowed; :func:`inspect` reports
+    vertices, inward-facing faces, and faces without area are all allowed; `inspect` reports
     them. A face without area is kept for files and pictures, but its edges weigh nothing, as in
     other ARAP programs: a vertex that has no other face stays where it is.
 
@@ -39,11 +39,11 @@ class Mesh:
 
     - vertices: (vertices, 3), in any unit of length.
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
-    - source: what :func:`load_mesh` remembers of a file with these faces, for :func:`save_mesh`.
+    - source: what `load_mesh` remembers of a file with these faces, for `save_mesh`.
 
     **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (see
     ``deform(rest=)`` for derivatives to the rest shape); a vertex is not finite; a face index is
-    out of range; a face repeats a vertex, or none has an area (:func:`repair`); the source has
+    out of range; a face repeats a vertex, or none has an area (`repair`); the source has
     other faces.
 
     Example:

@@ -52,7 +52,7 @@ def mark_of(data: bytes) -> bytes:
 def read_text(path: Path) -> str:
     """Return a text file, without the byte-order mark that some editors put first.
 
-    **Raises** InputError as :func:`read_bytes` does; also if the file is not UTF-8.
+    **Raises** InputError as `read_bytes` does; also if the file is not UTF-8.
     """
     try:
         return without_mark(read_bytes(path)).decode("utf-8")

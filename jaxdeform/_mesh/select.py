@@ -1,6 +1,6 @@
 """Choose vertices without their numbers, by place, distance, connection or an expression.
 
-Each function returns a :class:`jaxdeform.Selection`, which ``|``, ``&``, ``-`` and ``~`` combine.
+Each function returns a `Selection`, which ``|``, ``&``, ``-`` and ``~`` combine.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ def where(mesh: Mesh, expression: str) -> Selection:
 
     **Arguments**: mesh; expression, a text.
 
-    **Returns** a :class:`jaxdeform.Selection`, which may be empty.
+    **Returns** a `Selection`, which may be empty.
 
     **Raises** InputError: the expression cannot be read (a note shows the place by a caret); a
     division by zero, or an overflow; u, v or w where the mesh is flat.
@@ -57,7 +57,7 @@ def box(mesh: Mesh, low: ArrayLike, high: ArrayLike) -> Selection:
     **Arguments**: mesh; low and high, the corners (3,) in the unit of the mesh. Infinity leaves a
     side open.
 
-    **Returns** a :class:`jaxdeform.Selection`, which may be empty.
+    **Returns** a `Selection`, which may be empty.
 
     **Raises** InputError: a corner of another shape or with NaN; low above high.
 
@@ -92,7 +92,7 @@ def halfspace(
     - above, below: a plane each, of which one may be left out: its distance from the origin along
       the axis, in the unit of the mesh, or a point (3,) on it. Vertices on a plane are left out.
 
-    **Returns** a :class:`jaxdeform.Selection`, which may be empty.
+    **Returns** a `Selection`, which may be empty.
 
     **Raises** InputError: neither plane is given; an axis of length zero; other shapes; values that
     are not finite.
@@ -117,11 +117,11 @@ def halfspace(
 
 def sphere(mesh: Mesh, center: ArrayLike, radius: float) -> Selection:
     """Select the vertices in a sphere, its surface included. For distances along the surface of the
-    mesh see :func:`within`.
+    mesh see `within`.
 
     **Arguments**: mesh; center (3,); radius, 0 or more; both in the unit of the mesh.
 
-    **Returns** a :class:`jaxdeform.Selection`, which may be empty.
+    **Returns** a `Selection`, which may be empty.
 
     **Raises** InputError: another shape; values that are not finite; a negative radius.
 
@@ -142,7 +142,7 @@ def nearest(mesh: Mesh, point: ArrayLike, count: int = 1) -> Selection:
 
     **Arguments**: mesh; point (3,), in the unit of the mesh; count, how many vertices.
 
-    **Returns** a :class:`jaxdeform.Selection` of exactly that many vertices.
+    **Returns** a `Selection` of exactly that many vertices.
 
     **Raises** InputError: another shape; values that are not finite; a count above the number of
     vertices.
@@ -161,13 +161,13 @@ def nearest(mesh: Mesh, point: ArrayLike, count: int = 1) -> Selection:
 def within(mesh: Mesh, sources: ArrayLike, distance: float) -> Selection:
     """Select the vertices within a distance of some vertices, along the surface.
 
-    Exact geodesic distance, as of :func:`jaxdeform.geodesic_distances`; other connected components
+    Exact geodesic distance, as of `geodesic_distances`; other connected components
     are never within reach.
 
     **Arguments**: mesh; sources, vertex indices, a mask or a selection; distance, 0 or more, in the
     unit of the mesh.
 
-    **Returns** a :class:`jaxdeform.Selection`, which has the sources too.
+    **Returns** a `Selection`, which has the sources too.
 
     **Raises** InputError: no sources; a source out of range; a distance that is negative or not
     finite; a surface that is not manifold.
@@ -189,7 +189,7 @@ def component(mesh: Mesh, vertices: ArrayLike) -> Selection:
 
     **Arguments**: mesh; vertices, one vertex index, a list of them, a mask or a selection.
 
-    **Returns** a :class:`jaxdeform.Selection`.
+    **Returns** a `Selection`.
 
     **Raises** InputError: no vertices; an index out of range.
 
@@ -210,7 +210,7 @@ def border(mesh: Mesh) -> Selection:
 
     **Arguments**: mesh. Faces without an area count too: they close the surface.
 
-    **Returns** a :class:`jaxdeform.Selection`, empty for a closed mesh.
+    **Returns** a `Selection`, empty for a closed mesh.
 
     **Raises** InputError: mesh is no jd.Mesh.
 
@@ -230,7 +230,7 @@ def mask(mesh: Mesh, mask: ArrayLike) -> Selection:
 
     **Arguments**: mesh; mask, booleans (vertices,).
 
-    **Returns** a :class:`jaxdeform.Selection`, which may be empty.
+    **Returns** a `Selection`, which may be empty.
 
     **Raises** InputError: another shape; values that are not booleans.
 

@@ -50,7 +50,7 @@ def _count(data: bytes) -> int:
 
 
 def is_binary(data: bytes) -> bool:
-    """Return whether the content is that of a binary file that :func:`parse_stl` accepts."""
+    """Return whether the content is that of a binary file that `parse_stl` accepts."""
     return 0 < _count(data) * _FACET.itemsize <= len(data) - _HEAD
 
 

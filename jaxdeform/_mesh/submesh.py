@@ -14,7 +14,7 @@ from jaxdeform._mesh.selection import read_mask
 
 @dataclass(frozen=True, eq=False)
 class Submesh:
-    """A piece of a mesh around the free vertices; made by :func:`submesh`."""
+    """A piece of a mesh around the free vertices; made by `submesh`."""
 
     mesh: Mesh
     """The piece, as a mesh of its own."""
@@ -61,7 +61,7 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     - free: the vertices that may move: indices, a mask (vertices,) or a selection.
     - cells: the cells of the whole mesh; by default ``rings(mesh, 1)``.
 
-    **Returns** a :class:`Submesh`.
+    **Returns** a `Submesh`.
 
     **Raises** InputError: no vertex is free; an index is out of range; the cells are of another
     mesh.
