@@ -50,7 +50,8 @@ def _python(code: str, name: str, names: dict) -> str:
         try:
             exec(compile(code, name, "exec"), names)
         except jd.InputError as error:
-            return "\n".join([f"InputError: {error}", *getattr(error, "__notes__", [])])
+            notes = [note for note in getattr(error, "__notes__", []) if "JAX" not in note]
+            return "\n".join([f"InputError: {error}", *notes])
     return out.getvalue()
 
 
