@@ -13,6 +13,7 @@ PAGES = [name for name in page_names(ROOT) if not name.startswith("reference/")]
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in PAGES]
 )
+@pytest.mark.filterwarnings("ignore:negative weights:UserWarning")  # own-mesh.md speaks of it
 def test_the_code_of_a_page_says_what_the_page_says(name, tmp_path):
     with inside(tmp_path):
         run_page((ROOT / "docs" / name).read_text(encoding="utf-8"), name)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from page_code import run_page
 
 import jaxdeform as jd
 
@@ -149,11 +150,9 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 @pytest.mark.slow
 def test_readme_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert blocks
-    names = {}  # a reader goes from one block to the next, and so do the names
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), names)
+    # Of the commands, some name files of the reader.
+    blocks = re.sub(r"^```sh\n.*?^```", "", README, flags=re.DOTALL | re.MULTILINE)
+    names = run_page(blocks, "README.md")
     # What the text says comes out. The pose is that of the solver's tolerance.
     np.testing.assert_allclose(names["fit"].rigidity, [0.01, 30.0], rtol=0.02)
     low, high = names["fit"].interval.T
@@ -188,10 +187,3 @@ def test_readme_command_line_is_the_real_one():
 def test_citation_has_the_version_of_the_package():
     (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert cited == jd.__version__
-
-
-def test_linked_files_are_there():
-    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
-        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
-            if "://" not in target:
-                assert (page.parent / target).exists(), f"{page.name} links {target}"
