@@ -9,7 +9,7 @@ and then nearly all of A cancels. With the principal moments b of the cells, and
 the true Hessian at unstrained cells, in any rotation, lies between H(0) and H(4 lambda): the strain
 energy of Eq. 4.2 resists a change of T by 0 (a rotation) to 4 lambda (a stretch along an axis). The
 metric is half their sum. The true Hessian is at most twice that, so a plain step of this metric
-cannot raise the quadratic model. (docs/method.md has the proof.)
+cannot raise the quadratic model. (docs/mathematics.md has the proof.)
 
 Like A it is one matrix (vertices, vertices) for x, y and z, and its factor is kept by content
 (factor_cache.py). Rigidities are rounded up to half octaves, so that a fit, which changes them a
@@ -17,7 +17,7 @@ little each time, meets the same factor again: a metric that is too stiff is saf
 without rounding, with half and with whole octaves: cactus of constant 0.01 19, 20, 22; bar of 0.2
 35, 29, 44.)
 
-docs/benchmarks.md has what it gains. Where cells are stiff it gains a third of the evaluations, and
+What it gains stands in docs/mathematics.md. Where cells are stiff it gains a third of the evaluations, and
 its solve takes 2 to 4 times as long as that of A; so there A is used.
 """
 

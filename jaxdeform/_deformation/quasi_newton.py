@@ -43,7 +43,7 @@ class QuasiNewton:
     """``"stiffness"``: A^-1, the same for every rigidity. ``"material"``: a factor made for this
     rigidity. It needs 1/3 to 1/30 of the steps where materials are soft, and its solves take 2 to 4
     times as long. ``"auto"``: the second where a tenth of the cells is softer than a constant of 1
-    (:func:`rigidity_from_material`), on a CPU."""
+    (`rigidity_from_material`), on a CPU."""
 
     can_unroll: ClassVar[bool] = False
     needs_one_energy: ClassVar[bool] = True
