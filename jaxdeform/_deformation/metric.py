@@ -17,7 +17,7 @@ little each time, meets the same factor again: a metric that is too stiff is saf
 without rounding, with half and with whole octaves: cactus of constant 0.01 19, 20, 22; bar of 0.2
 35, 29, 44.)
 
-What it gains stands in docs/mathematics.md. Where cells are stiff it gains a third of the evaluations, and
+docs/mathematics.md has what it gains. Where cells are stiff that is a third of the evaluations, and
 its solve takes 2 to 4 times as long as that of A; so there A is used.
 """
 
