@@ -22,6 +22,10 @@ class Result(eqx.Enumeration):
         "Stopped at the step limit before the tolerance was reached: the shape is usable, but "
         "allow more steps (or loosen the tolerance) if you rely on derivatives."
     )
+    saddle = (
+        "At a saddle: the energy falls to both sides, and the descent left several saddles before. "
+        "Begin from a shape that is not symmetric (start), or allow more steps."
+    )
     not_finite = (
         "Not finite: a local step failed, or the numbers overflowed. The cells at fault are those "
         "whose `transforms` are not finite (`Solution.explain` names them). Try the default local "

@@ -68,7 +68,13 @@ def good_calls(folder: Path) -> dict:
         "Newton": (jd.Newton, {"max_steps": 3}),
         "QuasiNewton": (
             jd.QuasiNewton,
-            {"tolerance": 1e-3, "max_steps": 3, "history_length": 3, "metric": "material"},
+            {
+                "tolerance": 1e-3,
+                "max_steps": 3,
+                "history_length": 3,
+                "metric": "material",
+                "leave_saddles": False,
+            },
         ),
         "LaplacianEditor": (editor, {"targets": TARGETS}),
         "Submesh": (PIECE.reinsert, {"vertices": PIECE.mesh.vertices, "base": MESH.vertices}),

@@ -83,7 +83,7 @@ def estimate(
 
 
 def _fit(problem: jd.Problem, observed, label: np.ndarray, steps: int | None) -> jd.Estimate:
-    solver = jd.QuasiNewton() if steps is None else jd.Alternating(steps)
+    solver = jd.QuasiNewton(leave_saddles=False) if steps is None else jd.Alternating(steps)
     return patiently(
         "estimating",
         lambda: jd.estimate_rigidity(

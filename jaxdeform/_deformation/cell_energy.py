@@ -6,7 +6,7 @@ The sum over all cells is Eq. 4.4: E(p', T) = tr(p'^T A p') + sum_k phi_k(T_k),
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxdeform._linalg.small_matrices import (
     Grid,
@@ -52,26 +52,19 @@ def half_gradient(x: Grid, m: Grid, b: list[Array], lam: Array) -> Grid:
     return [[g[i][j] - m[j][i] for j in range(3)] for i in range(3)]
 
 
-def half_hessian(x: Grid, b: list[Array], lam: Array) -> list[list[Array]]:
-    """Half the Hessian of phi at X as a full 9x9 matrix. (Only its lower half is used.)"""
-    gram, outer = product(transpose(x), x), product(x, transpose(x))
-    rows: list[list[Array]] = []
-    for i in range(3):
-        for j in range(3):
-            row = []
-            for k in range(3):
-                for l in range(3):  # noqa: E741
-                    value = x[i][l] * x[k][j]
-                    if l == j:
-                        value = value + outer[i][k]
-                    if i == k:
-                        value = value + gram[l][j]
-                    if (i, j) == (k, l):
-                        row.append(2.0 * lam * (value - 1.0) + b[j])
-                    else:
-                        row.append(2.0 * lam * value)
-            rows.append(row)
-    return rows
+def half_hessian(t: Matrices, b: Vectors, lam: Scalars) -> Float[Array, "9 9 cells"]:
+    """Half the Hessian of phi at T, as a matrix: what `half_hessian_product` multiplies with."""
+    # Axes i, j, k, l, cell. (einsum would do it by batched products of 3x3 matrices, slowly.)
+    unit = jnp.eye(3, dtype=t.dtype)[..., None]
+    gram = sum(t[i][:, None] * t[i][None] for i in range(3))
+    outer = sum(t[:, j][:, None] * t[:, j][None] for j in range(3))
+    strain = (
+        unit[:, None, :, None] * (gram - unit)[None, :, None]
+        + outer[:, None, :, None] * unit[None, :, None]
+        + t[:, None, None] * jnp.swapaxes(t, 0, 1)[None, :, :, None]
+    )
+    data = unit[:, None, :, None] * unit[None, :, None] * b[None, :, None, None]
+    return (2.0 * lam[None, None, None, None] * strain + data).reshape(9, 9, -1)
 
 
 def half_hessian_product(x: Grid, b: list[Array], lam: Array, v: Grid) -> Grid:

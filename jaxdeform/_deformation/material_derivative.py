@@ -1,10 +1,10 @@
 """The derivative of the local step of the material: of its minimum, not of its iterations."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxdeform._deformation.cell_energy import half_gradient, half_hessian, half_hessian_product
 from jaxdeform._linalg.small_matrices import (
@@ -14,10 +14,10 @@ from jaxdeform._linalg.small_matrices import (
     Vectors,
     as_grid,
     from_grid,
-    ldl_factor,
-    ldl_solve,
+    inverse_of_symmetric,
     minus_identity,
     product,
+    times_vectors,
     transpose,
 )
 
@@ -55,25 +55,25 @@ def _material_with_derivative_jvp(primals, tangents):
 
 
 class _Hessian(NamedTuple):
-    """Half the Hessian of phi in every cell, factored.
+    """Half the Hessian of phi in every cell, and its inverse.
 
     As a linear solve of its own, so that derivatives of second order solve again instead of
-    differentiating the 9x9 elimination. H is factored outside of it: what solves for many right
-    sides, as conjugate gradients do, factors once.
+    differentiating the elimination. H is inverted outside of it: what solves for many right sides,
+    as conjugate gradients do, inverts once.
     """
 
     of: tuple[Grid, list[Array], Array]
-    """T, b and lambda where it was factored, as constants."""
-    factor: Any
+    """T, b and lambda where it was inverted, as constants."""
+    inverse: Float[Array, "9 9 cells"]
 
     @staticmethod
     def at(t: Matrices, b: Vectors, rigidity: Scalars) -> "_Hessian":
-        """Factor H; directions without stiffness get a floor."""
+        """Invert H; directions without stiffness get a floor."""
         t, b, rigidity = jax.lax.stop_gradient((t, b, rigidity))
         scale = rigidity + jnp.max(jnp.abs(b), axis=0)
         floor = jnp.finfo(t.dtype).eps * scale + jnp.finfo(t.dtype).tiny
-        of = as_grid(t), list(b), rigidity
-        return _Hessian(of, ldl_factor(half_hessian(*of), floor))
+        inverse = inverse_of_symmetric(half_hessian(t, b, rigidity), floor)
+        return _Hessian((as_grid(t), list(b), rigidity), inverse)
 
     def solve(self, of: tuple[Grid, list[Array], Array], right: Matrices) -> Matrices:
         """Solve H dT = right, with the derivatives of H where it is ``of`` T, b and lambda."""
@@ -82,7 +82,6 @@ class _Hessian(NamedTuple):
             return from_grid(half_hessian_product(*of, as_grid(v)))
 
         def solve(_, r: Matrices) -> Matrices:
-            solution = ldl_solve(self.factor, [r[i, j] for i in range(3) for j in range(3)])
-            return from_grid([solution[3 * i : 3 * i + 3] for i in range(3)])
+            return times_vectors(self.inverse, r.reshape(9, -1)).reshape(r.shape)
 
         return jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)

@@ -75,10 +75,9 @@ def metric_of(
     law = getattr(local, "strain_rigidity", None)
     if choice == "stiffness" or law is None or not isinstance(system.factor, HostCholesky):
         return None
-    rigidity = law(rigidity)
-    system, rigidity = jax.lax.stop_gradient((system, rigidity))
-    always = jnp.asarray(choice == "material")
     result = jax.ShapeDtypeStruct(system.factor.key.shape, np.uint32)
+    system, rigidity = jax.lax.stop_gradient((system, law(rigidity)))
+    always = jnp.asarray(choice == "material")
     return Metric(_key(result, always, rigidity, *_parts(system)), rigidity)
 
 
@@ -116,7 +115,8 @@ class _Parts(NamedTuple):
 
     @staticmethod
     def of(arrays) -> "_Parts":
-        return _Parts(*arrays[:6], arrays[6:])
+        key, starts, rows, values, free, moments, *covariance = arrays
+        return _Parts(key, starts, rows, values, free, moments, covariance)
 
     @property
     def stiffness(self) -> Matrix:

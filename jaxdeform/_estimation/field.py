@@ -98,7 +98,7 @@ def estimate_rigidity_field(
     targets: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
-    solver: Solver = QuasiNewton(),  # noqa: B008 (frozen)
+    solver: Solver = QuasiNewton(leave_saddles=False),  # noqa: B008 (frozen)
     adjoint: Adjoint | None = None,
     max_evaluations: int = 50,
     progress: Callable[[int, float, np.ndarray], None] | None = None,

@@ -129,7 +129,7 @@ def estimate_rigidity(
     target_noise: float | None = None,
     mask: ArrayLike | None = None,
     start: ArrayLike | None = None,
-    solver: Solver = QuasiNewton(),  # noqa: B008 (frozen)
+    solver: Solver = QuasiNewton(leave_saddles=False),  # noqa: B008 (frozen)
     adjoint: Adjoint | None = None,
     determined_within: float = 10.0,
     max_evaluations: int = 50,

@@ -75,6 +75,19 @@ class Minimum(NamedTuple):
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
+    @staticmethod
+    def unknown(start: Float[Array, "*batch 3 vertices"], settings: Settings) -> "Minimum":
+        """Return zeros of these shapes, for a start or for a batch of them."""
+        *lead, _, n = start.shape
+        zeros = lambda *shape: jnp.zeros((*lead, *shape), start.dtype)  # noqa: E731
+        return Minimum(
+            zeros(3, n),
+            zeros(3, 3, n),
+            zeros(settings.max_steps + 1),
+            jnp.zeros(lead, jnp.int32),
+            jnp.zeros(lead, bool),
+        )
+
 
 def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."]:
     """Return whether a plain step would gain less than the tolerance, or less than rounding hides.
@@ -162,13 +175,7 @@ def _run_queue(function, system, inputs, start, settings: Settings) -> Minimum:
     count = start.shape[0]
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
     slots = min(count, most)
-    out = Minimum(
-        jnp.zeros_like(start),
-        jnp.zeros((count, 3, *start.shape[1:]), start.dtype),
-        jnp.zeros((count, settings.max_steps + 1), start.dtype),
-        jnp.zeros(count, jnp.int32),
-        jnp.zeros(count, bool),
-    )
+    out = Minimum.unknown(start, settings)
     if not count:
         return out
     work = _empty(start[:slots], settings)

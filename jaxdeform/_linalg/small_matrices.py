@@ -1,7 +1,6 @@
 """Algebra of 3x3 and 9x9 matrices by components, over all cells at once."""
 
-from typing import NamedTuple
-
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -57,41 +56,37 @@ def cross(u: list[Array], v: list[Array]) -> list[Array]:
     ]
 
 
-class LDL(NamedTuple):
-    """The factors of symmetric matrices ``L D L^T``, by components."""
+def inverse_of_symmetric(
+    matrix: Float[Array, "k k cells"], floor: Float[Array, "cells"]
+) -> Float[Array, "k k cells"]:
+    """Return the inverses of symmetric matrices, by Gauss-Jordan elimination.
 
-    lower: list[list[Array]]
-    """L, of which only the entries below the unit diagonal are read."""
-    diagonal: list[Array]
+    A pivot below ``floor`` (a direction without stiffness) is replaced by ``floor``.
 
-
-def ldl_factor(matrix: list[list[Array]], floor: Array) -> LDL:
-    """Factor symmetric matrices, unrolled into components; only their lower halves are read.
-
-    A pivot below ``floor`` (a direction without stiffness) is replaced by ``floor``. For 9x9
-    matrices and 51,200 cells, this and one solve take 13 ms; a vmapped ``jnp.linalg.solve`` takes
-    four times as long.
+    An L D L^T factor, unrolled into components, is made three times as fast, but compiles for 2.7
+    instead of 0.6 s, and its solve takes 13 instead of 3 ms (9x9 matrices of 50,000 cells). A
+    derivative solves some 50 times.
     """
-    size = len(matrix)
-    lower: list[list[Array]] = [[matrix[0][0]] * size for _ in range(size)]
-    diagonal: list[Array] = []
-    for j in range(size):
-        scaled = [lower[j][k] * diagonal[k] for k in range(j)]
-        pivot = matrix[j][j] - sum(lower[j][k] * scaled[k] for k in range(j))
-        diagonal.append(jnp.where(jnp.abs(pivot) > floor, pivot, floor))
-        for i in range(j + 1, size):
-            value = matrix[i][j] - sum(lower[i][k] * scaled[k] for k in range(j))
-            lower[i][j] = value / diagonal[j]
-    return LDL(lower, diagonal)
+    unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+
+    def eliminate(k, a):
+        # In the pivot's row and column too: a - (column - e)(row + e) / pivot, e the unit vector.
+        pick = lambda axis: jax.lax.dynamic_index_in_dim(a, k, axis, keepdims=False)  # noqa: E731
+        row, column, e = pick(0), pick(1), unit[k][:, None]
+        pivot = jax.lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
+        pivot = jnp.where(jnp.abs(pivot) > floor, pivot, floor)
+        return a - (column - e)[:, None] * ((row + e) / pivot[None])[None]
+
+    return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 
 
-def ldl_solve(factor: LDL, right: list[Array]) -> list[Array]:
-    """Solve for one right-hand side with factored matrices."""
-    lower, diagonal = factor
-    size, y = len(right), list(right)
-    for i in range(size):
-        y[i] = y[i] - sum(lower[i][k] * y[k] for k in range(i))
-    y = [y[i] / diagonal[i] for i in range(size)]
-    for i in reversed(range(size)):
-        y[i] = y[i] - sum(lower[k][i] * y[k] for k in range(i + 1, size))
-    return y
+def times_vectors(
+    matrix: Float[Array, "k k cells"], vectors: Float[Array, "k cells"]
+) -> Float[Array, "k cells"]:
+    """Return the product of each matrix with its vector.
+
+    As a sum of columns: 3 ms where ``einsum`` takes 50 (9x9 matrices of 50,000 cells).
+    """
+    return sum(matrix[:, j] * vectors[j][None] for j in range(1, len(vectors))) + (
+        matrix[:, 0] * vectors[0][None]
+    )

@@ -1,0 +1,134 @@
+"""A minimum is told from a saddle, and saddles are left: other programs' shapes are the witness."""
+
+import igl
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdeform as jd
+from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.saddles import lowest_curvature
+from jaxdeform._linalg.lanczos import lowest_mode
+
+STAY = jd.QuasiNewton(leave_saddles=False)
+
+
+@pytest.fixture(scope="module")
+def pushed(bar, bar_problem):
+    """The bar pushed together by 30 of its 151 units: it buckles."""
+    hold = bar.vertices[bar_problem.handles]
+    return hold - np.where(hold[:, 1:2] > 75, [[0.0, 30.0, 0.0]], 0.0)
+
+
+def lowest(n: int, steps: int, shift: float):
+    """Return what some steps of Lanczos say of random matrices H and M, and the truth."""
+    rng = np.random.default_rng(n)
+    spread = np.linspace(0.0, 2.0, 3 * n)
+    spread[0] = shift
+    half = rng.standard_normal((3 * n, 3 * n)) + 4.0 * np.sqrt(n) * np.eye(3 * n)
+    mass = half @ half.T
+    basis = np.linalg.qr(rng.standard_normal((3 * n, 3 * n)))[0]
+    hessian = half @ (basis * spread) @ basis.T @ half.T
+    inverse = np.linalg.inv(mass)
+    shaped = lambda a: lambda x: (jnp.asarray(a) @ x.ravel()).reshape(x.shape)  # noqa: E731
+    start = jnp.asarray(rng.standard_normal((3, n)))
+    count = jnp.asarray(steps, jnp.int32)
+    value, x = lowest_mode(shaped(hessian), shaped(inverse), start, count, 40)
+    return float(value), np.asarray(x).ravel(), hessian, mass
+
+
+def test_lanczos_finds_a_negative_mode():
+    value, x, hessian, mass = lowest(40, 40, -0.5)
+    np.testing.assert_allclose(value, -0.5, atol=1e-6)
+    np.testing.assert_allclose(x @ hessian @ x, value, rtol=1e-6)
+    np.testing.assert_allclose(x @ mass @ x, 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5, 12])
+def test_lanczos_never_promises_too_much(steps):
+    """Its value is that of a vector, so never below the lowest one."""
+    for shift in (-0.3, 0.2):
+        assert lowest(30, steps, shift)[0] >= min(shift, 0.0) - 1e-9
+    assert not lowest(30, steps, 0.2)[1].any()
+
+
+def test_the_curvature_is_that_of_the_energy(bar, bar_problem, pushed):
+    """Along the direction that it returns, second differences of the energy are negative."""
+    out = jd.deform(bar_problem, pushed, 30.0, solver=STAY)
+    system = bar_problem.system
+    energy = ReducedEnergy(jd.Newton())
+    p = (out.vertices - system.center[None]).T
+    inputs = Inputs(p, jnp.full(722, 30.0), system.soft)
+    t = energy.evaluate(system, inputs, p).transforms
+    value, x = lowest_curvature(energy, system, inputs, None, p, t, jnp.asarray(24, jnp.int32))
+    at = lambda s: float(energy.evaluate(system, inputs, p + s * x).energy)  # noqa: E731
+    step = 0.1
+    second = (at(step) - 2.0 * at(0.0) + at(-step)) / (2.0 * step**2)
+    np.testing.assert_allclose(float(value), second, rtol=1e-3)
+    assert second < -0.01
+
+
+def test_the_rigid_bar_ends_where_libigl_does(bar, bar_handles_bent):
+    """libigl's alternating iteration leaves the saddle by its rounding errors, after 400 steps."""
+    problem, targets = bar_handles_bent
+    kwargs = {"local": jd.RotationFit()}
+    stays = jd.deform(problem, targets, 1.0, solver=STAY, **kwargs)
+    out = jd.deform(problem, targets, 1.0, **kwargs)
+    assert bool(out.ok)
+    data = igl.ARAPData()
+    data.energy, data.max_iter = igl.ARAP_ENERGY_TYPE_SPOKES, 1600
+    igl.arap_precomputation(bar.vertices, bar.faces, 3, problem.handles, data)
+    other = igl.arap_solve(targets, data, np.asarray(out.vertices))
+    rotations = jd.deform(problem, targets, 1.0, start=other, solver=jd.Alternating(1), **kwargs)
+    np.testing.assert_allclose(float(out.energy[-1]), float(rotations.energy[-1]), rtol=1e-6)
+    assert float(out.energy[-1]) < 0.9 * float(stays.energy[-1])
+
+
+@pytest.fixture(scope="module")
+def bar_handles_bent(bar, bar_problem, bar_targets):
+    problem = jd.precompute(bar, bar_problem.handles, cells=jd.spokes(bar))
+    return problem, np.asarray(bar_targets)
+
+
+def test_a_pushed_bar_buckles(bar_problem, pushed):
+    stays = jd.deform(bar_problem, pushed, 30.0, solver=STAY)
+    out = jd.deform(bar_problem, pushed, 30.0)
+    noise = 0.15 * np.random.default_rng(0).standard_normal((722, 3))
+    seen = jd.deform(bar_problem, pushed, 30.0, start=stays.vertices + noise, solver=STAY)
+    assert bool(out.ok)
+    np.testing.assert_allclose(float(out.energy[-1]), float(seen.energy[-1]), rtol=1e-6)
+    assert float(out.energy[-1]) < 0.95 * float(stays.energy[-1])
+    steps = int(out.steps)
+    assert np.all(np.diff(out.energy[: int(stays.steps) + 1]) <= 0)
+    np.testing.assert_array_equal(out.energy[steps:], out.energy[steps])
+
+
+def test_minima_are_left_alone(bar_problem, bar_targets):
+    for rigidity in (0.05, 30.0):
+        stays = jd.deform(bar_problem, bar_targets, rigidity, solver=STAY)
+        out = jd.deform(bar_problem, bar_targets, rigidity)
+        np.testing.assert_array_equal(out.vertices, stays.vertices)
+        assert int(out.steps) == int(stays.steps)
+
+
+def test_members_of_a_batch_leave_on_their_own(bar_problem, pushed):
+    rigidity = jnp.array([1.0, 30.0, 60.0])
+    many = jax.jit(jax.vmap(lambda x: jd.deform(bar_problem, pushed, x)))(rigidity)
+    for k, x in enumerate(rigidity):
+        one = jd.deform(bar_problem, pushed, x)
+        np.testing.assert_allclose(many.energy[k, -1], one.energy[-1], rtol=1e-7)
+
+
+def test_single_precision(bar, bar_problem, pushed):
+    single = jd.precompute(bar, bar_problem.handles, dtype=np.float32)
+    least = float(jd.deform(bar_problem, pushed, 30.0).energy[-1])
+    out = jd.deform(single, pushed, 30.0)
+    np.testing.assert_allclose(float(out.energy[-1]), least, rtol=1e-3)
+
+
+def test_the_step_limit_holds_for_all_descents_together(bar_problem, pushed):
+    out = jd.deform(bar_problem, pushed, 30.0, solver=jd.QuasiNewton(max_steps=12))
+    assert int(out.steps) <= 12
+    assert out.energy.shape == (13,)
+    assert out.result == jd.Result.step_limit
