@@ -56,8 +56,8 @@ def half_hessian(t: Matrices, b: Vectors, lam: Scalars) -> Float[Array, "9 9 cel
     """Half the Hessian of phi at T, as a matrix: what `half_hessian_product` multiplies with."""
     # Axes i, j, k, l, cell. (einsum would do it by batched products of 3x3 matrices, slowly.)
     unit = jnp.eye(3, dtype=t.dtype)[..., None]
-    gram = sum(t[i][:, None] * t[i][None] for i in range(3))
-    outer = sum(t[:, j][:, None] * t[:, j][None] for j in range(3))
+    gram = jnp.sum(t[:, :, None] * t[:, None], axis=0)
+    outer = jnp.sum(t[:, None] * t[None], axis=2)
     strain = (
         unit[:, None, :, None] * (gram - unit)[None, :, None]
         + outer[:, None, :, None] * unit[None, :, None]

@@ -23,8 +23,8 @@ from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._linalg.lanczos import lowest_mode
 from jaxdeform._linalg.lbfgs import Minimum, Settings
 
-# Steps of Lanczos: a quarter of those of the descent, within these bounds.
-_LEAST, MOST = 4, 24
+# Steps of Lanczos where the sign does not show before.
+MOST = 32
 # Saddles that are left one after another, and by how far, in diagonals.
 _TURNS, _AWAY = 4, 0.02
 # Members of a batch that are looked at side by side: each takes 650 bytes a vertex.
@@ -38,10 +38,9 @@ def lowest_curvature(
     metric: Metric | None,
     p: Float[Array, "3 vertices"],
     transforms: Float[Array, "3 3 vertices"],
-    steps: Int[Array, ""],
     most: int = MOST,
 ) -> tuple[Float[Array, ""], Float[Array, "3 vertices"]]:
-    """Return the lowest curvature of the reduced energy, as far as some steps know it, and where.
+    """Return the lowest curvature of the reduced energy, as far as its sign needs it, and where.
 
     It is relative to that of the metric, so it has no unit. The true one is no higher. The
     direction is 0 where the curvature is not negative.
@@ -49,14 +48,14 @@ def lowest_curvature(
 
     @custom_vmap
     def look(system, own):
-        inputs, metric, p, transforms, steps = own
+        inputs, metric, p, transforms = own
         at = lambda x: energy.evaluate(system, inputs, x, transforms).gradient  # noqa: E731
         _, hessian = jax.linearize(at, p)
         precondition = partial(apply_metric, system, metric)
         # Any vector that is no symmetric one will do.
         index = jnp.arange(p.size, dtype=p.dtype).reshape(p.shape)
         start = jnp.where(system.free[None], jnp.sin(index * (1.0 + 0.37 * index)), 0.0)
-        return lowest_mode(hessian, precondition, start, steps, most)
+        return lowest_mode(hessian, precondition, start, most)
 
     @look.def_vmap
     def look_at_some(size, is_batched, system, own):
@@ -67,7 +66,7 @@ def lowest_curvature(
         each = partial(look.fun, system)
         return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE)), (True, True)
 
-    return look(system, (inputs, metric, p, transforms, steps))
+    return look(system, (inputs, metric, p, transforms))
 
 
 class _Way(NamedTuple):
@@ -81,7 +80,7 @@ class _Way(NamedTuple):
 
 def leave_saddles(
     descend: Callable[[Float[Array, "3 vertices"]], Minimum],
-    curvature: Callable[[Array, Array, Array], tuple[Array, Array]],
+    curvature: Callable[[Array, Array], tuple[Array, Array]],
     start: Float[Array, "3 vertices"],
     size: Float[Array, ""],
     settings: Settings,
@@ -96,8 +95,7 @@ def leave_saddles(
         end = descend(way.start)
         first, old = way.turn == 0, way.best.energy[way.best.steps]
         lower = first | (end.energy[end.steps] < old - settings.tolerance * jnp.abs(old))
-        steps = jnp.clip(end.steps // 4, _LEAST, MOST)
-        value, along = curvature(end.p, end.transforms, steps)
+        value, along = curvature(end.p, end.transforms)
         longest = jnp.sqrt(jnp.max(jnp.sum(along**2, axis=0)))
         away = end.p + along * (_AWAY * size / jnp.where(longest > 0, longest, 1.0))
         both = jax.tree.map(partial(jnp.where, first), end, _joined(way.best, end))

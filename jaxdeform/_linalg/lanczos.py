@@ -15,14 +15,14 @@ def lowest_mode(
     multiply: Callable[[Vectors], Vectors],
     precondition: Callable[[Vectors], Vectors],
     start: Vectors,
-    steps: Int[Array, ""],
     most: int,
 ) -> tuple[Float[Array, ""], Vectors]:
-    """Return the lowest ``mu`` with ``H x = mu M x`` as far as it is known after some steps, and x.
+    """Return the lowest ``mu`` with ``H x = mu M x``, as far as its sign needs it, and x.
 
     H is symmetric, ``precondition`` is M^-1, positive definite. The value is that of x itself,
     ``x^T H x`` with ``x^T M x = 1``: never below the true one, so that a negative value proves that
-    H has negative curvature. x is 0 where the value is not negative.
+    H has negative curvature. x is 0 where the value is not negative. It stops once the value is
+    negative, or twice as large as its error bound, or after ``most`` steps.
 
     The vectors are not kept but made again for x, by a second run, so that memory does not grow
     with the steps. (They lose their orthogonality, which does no harm to the lowest mode.)
@@ -32,36 +32,39 @@ def lowest_mode(
     """
     first = precondition(start)
     size = jnp.sqrt(_dot(start, first))
-    begin = _State(start / size, first / size, jnp.zeros_like(start), jnp.zeros((), start.dtype))
-    diagonal = jnp.zeros(most, start.dtype)
+    zero, none = jnp.zeros((), start.dtype), jnp.zeros(most, start.dtype)
+    begin = _State(start / size, first / size, jnp.zeros_like(start), zero)
 
-    def step(weights, k, carried):
-        state, alpha, beta, x = carried
-        x = x + weights[k] * state.z
+    def step(weights, run: "_Run") -> "_Run":
+        k, state, *_ = run
+        x = run.x + weights[k] * state.z
         w = multiply(state.z) - state.beta * state.before
         value = _dot(w, state.z)
         w = w - value * state.q
         z = precondition(w)
-        norm = jnp.sqrt(jnp.maximum(_dot(w, z), 0.0))
-        inverse = jnp.where(norm > 0, 1.0 / jnp.where(norm > 0, norm, 1.0), 0.0)
-        state = _State(w * inverse, z * inverse, state.q, norm)
-        return state, alpha.at[k].set(value), beta.at[k].set(norm), x
+        beta = jnp.sqrt(jnp.maximum(_dot(w, z), 0.0))
+        inverse = jnp.where(beta > 0, 1.0 / jnp.where(beta > 0, beta, 1.0), 0.0)
+        after = _State(w * inverse, z * inverse, state.q, beta)
+        alphas, betas = run.alphas.at[k].set(value), run.betas.at[k].set(beta)
+        return _Run(k + 1, after, alphas, betas, x, *_lowest(alphas, betas, k + 1))
 
-    def run(carried):
-        turn, weights, *_ = carried
-        begun = begin, diagonal, diagonal, jnp.zeros_like(start)
-        _, alpha, beta, x = jax.lax.fori_loop(0, steps, partial(step, weights), begun)
-        mu, weights = _lowest(alpha, beta, steps)
-        return turn + 1, weights, mu, x
+    def known(run: "_Run") -> Array:
+        error = run.state.beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
+        sure = (run.mu < 0.0) | (2.0 * error < run.mu) | ~jnp.isfinite(run.mu)
+        return (run.steps >= _LEAST) & sure | (run.steps >= most)
 
-    def wanted(carried):
-        turn, _, mu, _ = carried
-        return (turn == 0) | ((turn == 1) & (mu < 0.0))
+    at = jnp.zeros((), jnp.int32)
+    nothing = _Run(at, begin, none, none, jnp.zeros_like(start), zero, none)
 
-    zero = jnp.zeros((), start.dtype)
-    begun = jnp.zeros((), jnp.int32), diagonal, zero, jnp.zeros_like(start)
-    _, _, mu, x = jax.lax.while_loop(wanted, run, begun)
-    return mu, x
+    def again(carried):
+        turn, old = carried
+        ended = lambda run: jnp.where(turn == 0, known(run), run.steps >= old.steps)  # noqa: E731
+        go_on = lambda run: ~ended(run)  # noqa: E731
+        return turn + 1, jax.lax.while_loop(go_on, partial(step, old.weights), nothing)
+
+    wanted = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
+    turn, run = jax.lax.while_loop(wanted, again, (at, nothing))
+    return run.mu, jnp.where(turn == 2, run.x, 0.0)
 
 
 class _State(NamedTuple):
@@ -73,16 +76,29 @@ class _State(NamedTuple):
     beta: Float[Array, ""]
 
 
-def _lowest(alpha, beta, steps) -> tuple[Float[Array, ""], Float[Array, "most"]]:
-    """Return the lowest eigenvalue of the tridiagonal matrix of the steps done, and its vector."""
-    most = alpha.shape[0]
-    done = jnp.arange(most, dtype=steps.dtype) < steps
-    inside = done[1:] & (beta[:-1] > 0)
-    diagonal = jnp.where(done, alpha, 1e3 * (1.0 + jnp.max(jnp.abs(alpha))))
-    off = jnp.where(inside, beta[:-1], 0.0)
+class _Run(NamedTuple):
+    steps: Int[Array, ""]
+    state: _State
+    alphas: Float[Array, "most"]
+    betas: Float[Array, "most"]
+    x: Vectors
+    mu: Float[Array, ""]
+    """The lowest eigenvalue of the tridiagonal matrix of the steps done."""
+    weights: Float[Array, "most"]
+    """Its eigenvector."""
+
+
+def _lowest(alphas, betas, steps) -> tuple[Float[Array, ""], Float[Array, "most"]]:
+    done = jnp.arange(alphas.shape[0], dtype=steps.dtype) < steps
+    diagonal = jnp.where(done, alphas, 1e3 * (1.0 + jnp.max(jnp.abs(alphas))))
+    off = jnp.where(done[1:] & (betas[:-1] > 0), betas[:-1], 0.0)
     values, vectors = jnp.linalg.eigh(jnp.diag(diagonal) + jnp.diag(off, 1) + jnp.diag(off, -1))
     return values[0], jnp.where(done, vectors[:, 0], 0.0)
 
 
 def _dot(u: Vectors, v: Vectors) -> Float[Array, ""]:
     return jnp.sum(u * v)
+
+
+# The first values say little.
+_LEAST = 4
