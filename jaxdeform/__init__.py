@@ -28,6 +28,7 @@ from jaxdeform._deformation.local_step import (
     Newton,
     RotationFit,
 )
+from jaxdeform._deformation.path import deform_path
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
@@ -90,6 +91,7 @@ __all__ = [
     "bounded_biharmonic_weights",
     "cotangent_weights",
     "deform",
+    "deform_path",
     "dual_quaternion_skinning",
     "energy",
     "estimate_rigidity",

@@ -101,6 +101,22 @@ def good_calls(folder: Path) -> dict:
                 "throw": False,
             },
         ),
+        "deform_path": (
+            jd.deform_path,
+            {
+                "problem": soft,
+                "targets": np.stack([MESH.vertices[HANDLES], TARGETS]),
+                "rigidity": np.ones(N),
+                "local": jd.Newton(),
+                "solver": jd.QuasiNewton(),
+                "start": MESH.vertices,
+                "handle_weights": np.ones(5),
+                "normals": False,
+                "adjoint": jd.Implicit(),
+                "throw": False,
+                "progress": print,
+            },
+        ),
         "dual_quaternion_skinning": (jd.dual_quaternion_skinning, SKIN),
         "energy": (
             jd.energy,

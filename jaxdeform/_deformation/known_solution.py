@@ -5,10 +5,10 @@ from jaxtyping import Array, Float
 
 from jaxdeform._checks import check_rigidity
 from jaxdeform._deformation.adjoint import Implicit
+from jaxdeform._deformation.arguments import spread_targets
 from jaxdeform._deformation.local_step import Newton
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform._deformation.solve import spread_targets
 
 
 def minimum_near(

@@ -1,7 +1,6 @@
 """Deforming a mesh: the public function, and the solution that it returns."""
 
 from functools import partial
-from typing import cast
 
 import equinox as eqx
 import jax
@@ -10,22 +9,13 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._arrays import as_array, is_concrete
-from jaxdeform._checks import (
-    check_flag,
-    check_positions,
-    check_rigidity,
-    read_host_positions,
-    read_positions,
-)
-from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._checks import check_flag, check_positions, check_rigidity
+from jaxdeform._deformation.arguments import Settings, from_center, read_inputs, read_settings
 from jaxdeform._deformation.cell_energy import cell_energies
-from jaxdeform._deformation.descent import Adjoint, Anchor, Solver, choose_adjoint
+from jaxdeform._deformation.descent import Adjoint, Anchor, Solver
 from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
-from jaxdeform._deformation.local_step_check import check_local_step
 from jaxdeform._deformation.problem import Problem, System, check_problem
-from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.verdict import inside_out, verdict
 from jaxdeform._errors import ArrayLike, InputError
@@ -134,34 +124,21 @@ def deform(
         (722, 3)
     """
     check_problem(problem)
-    check_flag("normals", normals)
     check_flag("throw", throw)
-    if solver is None:
-        solver = Alternating() if normals else QuasiNewton()
-    adjoint = choose_adjoint(solver, adjoint)
-    if normals and (solver.needs_one_energy or adjoint.needs_one_energy):
-        raise InputError(
-            "with normals the iteration is not the descent of one energy (n' lags behind): use "
-            "solver=Alternating() and adjoint=Unrolled()"
-        )
-    check_local_step(local)
-    count, dtype = problem.n_vertices, problem.dtype
-    rigidity = check_rigidity(rigidity, count, dtype)
-    relative = _from_center(problem, "targets", targets, len(problem.handles), "handle")
+    how = read_settings(local, solver, adjoint, normals)
+    rows = len(problem.handles)
+    relative = from_center(problem, "targets", targets, (rows, 3), "handle")
+    inputs = read_inputs(problem, relative, rigidity, handle_weights)
     if start is not None:
-        start = _from_center(problem, "start", start, count, "vertex")
-    spread = spread_targets(problem, relative)
-    soft = _spread_weights(problem, handle_weights)
-    # NumPy's arrays are JAX's once they are inside.
-    inputs = Inputs(cast(Array, spread), cast(Array, rigidity), soft)
+        start = from_center(problem, "start", start, (problem.n_vertices, 3), "vertex")
     if rest is not None or edge_weights is not None:
         inputs = inputs._replace(geometry=read_geometry(problem, rest, edge_weights))
-        if not adjoint.needs_one_energy:
+        if not how.adjoint.needs_one_energy:
             raise InputError(
                 "rest and edge_weights are differentiated by Implicit() only: give "
                 "adjoint=jd.Implicit()"
             )
-    out = _solve(problem.system, inputs, start, ReducedEnergy(local, normals), solver, adjoint)
+    out = _solve(problem.system, inputs, start, how)
     return out.result.error_if(out, ~out.ok) if throw else out
 
 
@@ -192,84 +169,44 @@ def energy(
     return jnp.sum(p * stiff) + jnp.sum(cells)
 
 
-def _from_center(
-    problem: Problem, name: str, value: ArrayLike, rows: int, unit: str
-) -> Float[Array, "3 rows"] | Float[np.ndarray, "3 rows"]:
-    """Read positions (rows, 3) relative to the centre of the rest shape.
-
-    Known values are subtracted in float64, so that a float32 problem far from the origin loses no
-    digit of where its handles go.
-    """
-    if isinstance(value, Array) and not is_concrete(value):
-        given = read_positions(name, value, (rows, 3), problem.dtype, unit)
-        return jnp.asarray(given - problem.system.center[None]).T
-    given = read_host_positions(name, value, (rows, 3), unit) - problem.mesh.center
-    with np.errstate(over="ignore"):
-        given = given.T.astype(problem.dtype)
-    if not np.isfinite(given).all():
-        raise InputError(f"{name} are too large for {problem.dtype}: use another unit of length")
-    return given
-
-
-def spread_targets(
-    problem: Problem,
-    targets: Float[Array, "3 handles"] | Float[np.ndarray, "3 handles"],
-) -> Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"]:
-    """Spread the targets over an array of all vertices, in NumPy where they are known.
-
-    So the compiled code sees shapes that depend on the mesh alone: another number of handles does
-    not compile anything anew.
-    """
-    system, handles = problem.system, problem.handles
-    if all(map(is_concrete, (targets, system.rest, handles))):
-        spread = np.array(system.rest)
-        spread[:, np.asarray(handles)] = targets
-        return spread
-    return system.rest.at[:, handles].set(targets)
-
-
-def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "vertices"]:
-    """Spread the weights of soft handles over all vertices, 0 at hard ones and elsewhere."""
-    system, handles = problem.system, problem.handles
-    if weights is None:
-        return system.soft
-    given = as_array(weights, problem.dtype, "handle_weights")
-    if given.shape not in ((), handles.shape):
-        raise InputError(
-            f"handle_weights have shape {given.shape}: give one number or one per handle, "
-            f"{handles.shape}"
-        )
-    given = jnp.broadcast_to(given, handles.shape)
-    given = jnp.where(system.free[handles], given, 0.0)
-    if is_concrete(given) and is_concrete(system.soft):
-        most = np.asarray(system.soft)[np.asarray(handles)]
-        bad = np.flatnonzero(~((np.asarray(given) >= 0) & (np.asarray(given) <= most)))
-        if bad.size:
-            raise InputError(
-                f"the weight of handle {handles[bad[0]]} is {given[bad[0]]}: give 0 to "
-                f"{most[bad[0]]}, the weight that it had in precompute"
-            )
-    return jnp.zeros_like(system.soft).at[handles].set(given)
-
-
-@partial(jax.jit, static_argnames=("energy", "solver", "adjoint"))
+@partial(jax.jit, static_argnames="how")
 def _solve(
     system: System,
     inputs: Inputs,
     start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
-    energy: ReducedEnergy,
-    solver: Solver,
-    adjoint: Adjoint,
+    how: Settings,
 ) -> Solution:
-    system = _without_derivative(system)
-    p = _first_positions(system, inputs, start)
-    end, anchor = adjoint.solve(solver, energy, system, inputs, p)
+    system = without_derivative(system)
+    if start is None:
+        start = system.rest + guess(system, inputs.targets - system.rest)
+    return descend(system, inputs, jnp.asarray(start), how)[0]
+
+
+def guess(system: System, displacement: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+    """Return the displacement of all vertices that Laplacian editing makes of that of handles.
+
+    Soft handles lead like hard ones.
+    """
+    led = ~system.free | (system.soft > 0)
+    return system.initial_guess(jnp.where(led[None], displacement, 0.0))
+
+
+def descend(
+    system: System, inputs: Inputs, start: Float[Array, "3 vertices"], how: Settings
+) -> tuple[Solution, Float[Array, "3 vertices"]]:
+    """Minimise from a start, whose hard handles need not be on their targets.
+
+    Return the solution, and its positions relative to the centre of the rest shape.
+    """
+    energy, solver, adjoint = how
+    start = jnp.where(system.free[None], start, inputs.targets)
+    end, anchor = adjoint.solve(solver, energy, system, inputs, start)
     p, steps = end.positions, end.steps
     transforms, value = _with_derivatives_at_end(
         energy, system, inputs, anchor, end.transforms, end.energy[steps]
     )
     after = jnp.arange(end.energy.shape[0], dtype=steps.dtype) >= steps
-    return Solution(
+    solution = Solution(
         vertices=(p + system.center[:, None]).T,
         transforms=jnp.einsum(
             "aik,jik->kaj", transforms, system.principal_axes, precision="highest"
@@ -279,33 +216,23 @@ def _solve(
         result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
         flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
     )
+    return solution, p
 
 
 @jax.custom_jvp
-def _without_derivative(system: System) -> System:
+def without_derivative(system: System) -> System:
     """Return the system, which refuses to be differentiated in."""
     return system
 
 
-@partial(_without_derivative.defjvp, symbolic_zeros=True)
-def _without_derivative_jvp(primals, tangents):
+@partial(without_derivative.defjvp, symbolic_zeros=True)
+def without_derivative_jvp(primals, tangents):
     if not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents)):
         raise InputError(
             "the arrays of a Problem have no derivative here: differentiate in rest= and "
             "edge_weights= of deform, in targets, rigidity or handle_weights"
         )
     return primals[0], tangents[0]
-
-
-def _first_positions(system: System, inputs: Inputs, start) -> Float[Array, "3 vertices"]:
-    if start is None:
-        # Soft handles lead the first guess like hard ones.
-        led = ~system.free | (system.soft > 0)
-        displacement = jnp.where(led[None], inputs.targets - system.rest, 0.0)
-        p = system.rest + system.initial_guess(displacement)
-    else:
-        p = start
-    return jnp.where(system.free[None], p, inputs.targets)
 
 
 def _with_derivatives_at_end(

@@ -1,0 +1,121 @@
+"""What a deformation is given: arrays and settings, checked, and spread over the mesh."""
+
+from typing import Any, NamedTuple, cast
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdeform._arrays import as_array, is_concrete
+from jaxdeform._checks import (
+    check_flag,
+    check_rigidity,
+    read_host_positions,
+    read_positions,
+)
+from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
+from jaxdeform._deformation.local_step_check import check_local_step
+from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.quasi_newton import QuasiNewton
+from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._errors import ArrayLike, InputError
+
+
+class Settings(NamedTuple):
+    """What does not depend on values, and is compiled into the program."""
+
+    energy: ReducedEnergy
+    solver: Solver
+    adjoint: Adjoint
+
+
+def read_settings(local: Any, solver: Any, adjoint: Any, normals: Any) -> Settings:
+    """Return the settings of a deformation, or raise InputError: they exclude each other."""
+    check_flag("normals", normals)
+    if solver is None:
+        solver = Alternating() if normals else QuasiNewton()
+    adjoint = choose_adjoint(solver, adjoint)
+    if normals and (solver.needs_one_energy or adjoint.needs_one_energy):
+        raise InputError(
+            "with normals the iteration is not the descent of one energy (n' lags behind): use "
+            "solver=Alternating() and adjoint=Unrolled()"
+        )
+    check_local_step(local)
+    return Settings(ReducedEnergy(local, normals), solver, adjoint)
+
+
+def read_inputs(
+    problem: Problem,
+    targets: Float[Array, "*frames 3 handles"] | Float[np.ndarray, "*frames 3 handles"],
+    rigidity: ArrayLike,
+    handle_weights: ArrayLike | None,
+) -> Inputs:
+    """Check the rigidity and the weights, and spread everything over all vertices."""
+    rigidity = check_rigidity(rigidity, problem.n_vertices, problem.dtype)
+    spread = spread_targets(problem, targets)
+    soft = _spread_weights(problem, handle_weights)
+    # NumPy's arrays are JAX's once they are inside.
+    return Inputs(cast(Array, spread), cast(Array, rigidity), soft)
+
+
+def from_center(
+    problem: Problem, name: str, value: ArrayLike, shape: tuple[int, ...], unit: str
+) -> Float[Array, "*frames 3 rows"] | Float[np.ndarray, "*frames 3 rows"]:
+    """Read positions (*frames, rows, 3) relative to the centre of the rest shape.
+
+    Known values are subtracted in float64, so that a float32 problem far from the origin loses no
+    digit of where its handles go.
+    """
+    if isinstance(value, Array) and not is_concrete(value):
+        given = read_positions(name, value, shape, problem.dtype, unit)
+        center = problem.system.center.reshape((1,) * (len(shape) - 1) + (3,))
+        return jnp.swapaxes(jnp.asarray(given - center), -1, -2)
+    given = read_host_positions(name, value, shape, unit) - problem.mesh.center
+    with np.errstate(over="ignore"):
+        given = given.swapaxes(-1, -2).astype(problem.dtype)
+    if not np.isfinite(given).all():
+        raise InputError(f"{name} are too large for {problem.dtype}: use another unit of length")
+    return given
+
+
+def spread_targets(
+    problem: Problem,
+    targets: Float[Array, "*frames 3 handles"] | Float[np.ndarray, "*frames 3 handles"],
+) -> Float[Array, "*frames 3 vertices"] | Float[np.ndarray, "*frames 3 vertices"]:
+    """Spread the targets over an array of all vertices, in NumPy where they are known.
+
+    So the compiled code sees shapes that depend on the mesh alone: another number of handles does
+    not compile anything anew.
+    """
+    system, handles = problem.system, problem.handles
+    shape = *targets.shape[:-1], problem.n_vertices
+    if all(map(is_concrete, (targets, system.rest, handles))):
+        spread = np.array(np.broadcast_to(system.rest, shape))
+        spread[..., np.asarray(handles)] = targets
+        return spread
+    return jnp.broadcast_to(system.rest, shape).at[..., handles].set(targets)
+
+
+def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "vertices"]:
+    """Spread the weights of soft handles over all vertices, 0 at hard ones and elsewhere."""
+    system, handles = problem.system, problem.handles
+    if weights is None:
+        return system.soft
+    given = as_array(weights, problem.dtype, "handle_weights")
+    if given.shape not in ((), handles.shape):
+        raise InputError(
+            f"handle_weights have shape {given.shape}: give one number or one per handle, "
+            f"{handles.shape}"
+        )
+    given = jnp.broadcast_to(given, handles.shape)
+    given = jnp.where(system.free[handles], given, 0.0)
+    if is_concrete(given) and is_concrete(system.soft):
+        most = np.asarray(system.soft)[np.asarray(handles)]
+        bad = np.flatnonzero(~((np.asarray(given) >= 0) & (np.asarray(given) <= most)))
+        if bad.size:
+            raise InputError(
+                f"the weight of handle {handles[bad[0]]} is {given[bad[0]]}: give 0 to "
+                f"{most[bad[0]]}, the weight that it had in precompute"
+            )
+    return jnp.zeros_like(system.soft).at[handles].set(given)
