@@ -19,6 +19,8 @@ from jaxdeform._mesh.writing import check_place, write_atomically
 
 # Where the CPU draws, 40 million pixels take 3 GB; 16,384 is the width that graphics systems allow.
 _MOST_PIXELS, _MOST_WIDTH = 40e6, 16384
+# The frames of an animation are in memory together, 1 MB each.
+_MOST_FRAMES = 200
 
 
 def render(
@@ -64,34 +66,75 @@ def render(
     most = min((_MOST_PIXELS / 1.3 / len(arrays)) ** 0.5, _MOST_WIDTH / len(arrays))
     check_count("width", width, least=16, most=int(most))
     check_picture_path(path)
+    plotter = _plotter(len(arrays), width)
+    scale = _color_scale([v for v in colors if v is not None], label)
+    for k, pose in enumerate(arrays):
+        plotter.subplot(0, k)
+        _add_surface(plotter, mesh, pose, colors[k], scale)
+        if k < len(titles):
+            plotter.add_text(titles[k], font_size=10)
+    plotter.link_views()
+    _look_at(plotter, arrays)
+    image = np.asarray(plotter.screenshot(return_img=True))
+    plotter.close()
+    write_atomically(path, _png(image))
+
+
+def animate(
+    path: Path,
+    mesh: Mesh,
+    poses: Sequence[ArrayLike] | np.ndarray,
+    *,
+    values: ArrayLike | None = None,
+) -> None:
+    """Draw poses one after the other into an animated GIF, which takes four seconds and repeats.
+
+    Of very many poses it shows some, evenly chosen, with the last. **Raises** InputError as
+    :func:`render`.
+    """
+    arrays = _read_poses(mesh, poses)
+    (color,) = _read_values(mesh, [values], 1)
+    check_picture_path(path, ".gif")
+    chosen = np.linspace(len(arrays) - 1, 0, min(len(arrays), _MOST_FRAMES)).round().astype(int)
+    arrays = [arrays[k] for k in chosen[::-1]]
+    plotter = _plotter(1, 500)
+    scale = _color_scale([] if color is None else [color], "rigidity")
+    surface = _add_surface(plotter, mesh, arrays[0], color, scale)
+    _look_at(plotter, arrays)
+    images = []
+    for pose in arrays:
+        surface.points = pose
+        plotter.render()
+        images.append(np.asarray(plotter.screenshot(return_img=True)))
+    plotter.close()
+    write_atomically(path, _gif(images))
+
+
+def _plotter(views: int, width: int) -> Any:
     import pyvista  # slow to import, and needed only here
     from vtkmodules.vtkCommonCore import vtkLogger
 
     # Without a display VTK falls back to drawing in memory, which is what we want: no warning.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-    plotter = pyvista.Plotter(
-        shape=(1, len(arrays)), window_size=[width * len(arrays), int(1.3 * width)], off_screen=True
-    )
-    shown = [v for v in colors if v is not None]
-    for k, pose in enumerate(arrays):
-        plotter.subplot(0, k)
-        color = colors[k]
-        options: dict[str, Any] = {"color": "lightsteelblue"}
-        if color is not None:
-            options = {"scalars": color, **_color_scale(shown, label)}
-        surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
-        plotter.add_mesh(surface, show_edges=mesh.n_faces < 5000, line_width=0.5, **options)
-        if k < len(titles):
-            plotter.add_text(titles[k], font_size=10)
-    # Look along the direction in which all poses together are thinnest.
-    together = np.concatenate(arrays)
-    plotter.link_views()
+    size = [width * views, int(1.3 * width)]
+    return pyvista.Plotter(shape=(1, views), window_size=size, off_screen=True)
+
+
+def _add_surface(plotter: Any, mesh: Mesh, pose: np.ndarray, color, scale: dict[str, Any]) -> Any:
+    """Add a surface to the view, in one colour if it has no values; return it."""
+    import pyvista
+
+    surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
+    options = {"color": "lightsteelblue"} if color is None else {"scalars": color, **scale}
+    plotter.add_mesh(surface, show_edges=mesh.n_faces < 5000, line_width=0.5, **options)
+    return surface
+
+
+def _look_at(plotter: Any, poses: list[np.ndarray]) -> None:
+    """Look along the direction in which all poses together are thinnest."""
+    together = np.concatenate(poses)
     plotter.camera_position = _camera(together)
-    # The decorator of pyvista hides self from pyright.
-    plotter.reset_camera(bounds=_bounds(together))  # pyright: ignore[reportCallIssue]
-    image = np.asarray(plotter.screenshot(return_img=True))
-    plotter.close()
-    write_atomically(path, _png(image))
+    plotter.reset_camera(bounds=_bounds(together))
 
 
 def _read_poses(mesh: Mesh, poses: Any) -> list[np.ndarray]:
@@ -156,9 +199,26 @@ def _png(image: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def check_picture_path(path: Path) -> None:
+def _gif(images: list[np.ndarray]) -> bytes:
+    from PIL import Image  # comes with pyvista, which needs one more package for GIFs
+
+    content = BytesIO()
+    first, *others = (Image.fromarray(image).quantize(128) for image in images)
+    milliseconds = max(20, round(4000 / len(images)))
+    first.save(
+        content,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        duration=milliseconds,
+        loop=0,
+    )
+    return content.getvalue()
+
+
+def check_picture_path(path: Path, suffix: str = ".png") -> None:
     """Raise InputError if no picture can be written at this path."""
-    if path.suffix.lower() != ".png":
+    if path.suffix.lower() != suffix:
         raise InputError(f"{path}: pictures are PNG files: use a .png name")
     if find_spec("pyvista") is None:
         raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'")

@@ -1,10 +1,12 @@
 """The command ``jaxdeform deform``."""
 
 import time
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import jax
 import numpy as np
 import typer
 from jaxtyping import Float
@@ -13,10 +15,8 @@ from typer.core import TyperCommand
 import jaxdeform as jd
 from jaxdeform._apps.arguments import MEDIUM, Material, read_material
 from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
-from jaxdeform._apps.results import save_result
-from jaxdeform._apps.talk import console, patiently, say_wrote, since
-from jaxdeform._mesh.files import check_output, format_of
-from jaxdeform._plotting import check_picture_path
+from jaxdeform._apps.output import Output
+from jaxdeform._apps.talk import console, counted, patiently, since
 
 
 class Method(StrEnum):
@@ -106,6 +106,17 @@ Steps = Annotated[
     ),
 ]
 
+Frames = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=9999,
+        help="Go there in so many even steps, each from the one before, and write each as a file: "
+        "-o out.obj writes out_0001.obj and so on. Targets of a handle file are reached on "
+        "straight lines. The only way to turn by 360 degrees.",
+    ),
+]
+
 
 def deform(
     mesh: Annotated[Path, typer.Argument(help="OBJ, OFF, PLY or STL file.")],
@@ -124,9 +135,11 @@ def deform(
     stiff: Stiff = None,
     rings: Rings = None,
     steps: Steps = None,
+    frames: Frames = None,
     normals: Annotated[bool, typer.Option(help="Add the normal term (Eq. 4.7).")] = False,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG file for a picture of both shapes.")
+        Path | None,
+        typer.Option(help="PNG file for a picture of both shapes; with --frames also a GIF."),
     ] = None,
 ) -> None:
     """Move some vertices of a mesh and hold others; the rest of it follows.
@@ -134,10 +147,8 @@ def deform(
     The vertices are chosen by --fix and --move, or by a handle file.
     """
     shape = jd.load_mesh(mesh)
-    # Check all arguments before the long work.
-    check_output(out, shape)
-    if picture is not None:
-        check_picture_path(picture)
+    output = Output(out, frames, picture)
+    output.check(shape)  # all arguments are checked before the long work
     options = {"--rigidity": rigidity, "--stiff": stiff, "--rings": rings}
     options |= {"--steps": steps, "--normals": normals}
     for name in _UNREAD[method]:
@@ -147,20 +158,16 @@ def deform(
     material = read_material(shape, rigidity, stiff or [])
     console.print(str(moves))
     if method == Method.laplacian:
-        result = _edited(shape, moves)
+        result = _edited(shape, moves, frames)
     else:
-        result = _deformed(shape, moves, _Settings(method, material, rings or 1, steps, normals))
+        settings = _Settings(method, material, rings or 1, steps, normals)
+        result = _deformed(shape, moves, settings, frames)
     # The result first, then words about it: whatever happens to those, the work is kept.
-    color = result.rigidity if format_of(out) == ".ply" else None
-    save_result(out, shape, result.vertices, color)
+    output.save(shape, result.poses, result.rigidity)
     for line in result.words:
         console.print(line)
-    say_wrote(out)
-    if picture is not None:
-        poses = [shape.vertices, result.vertices]
-        colors = [None, result.rigidity] if material.varies else []
-        jd.render(picture, shape, poses, titles=["rest", "deformed"], values=colors)
-        say_wrote(picture)
+    output.say_wrote()
+    output.draw(shape, result.poses, result.rigidity if material.varies else None)
 
 
 def _read_moves(
@@ -199,18 +206,22 @@ class _Settings(NamedTuple):
 
 
 class _Result(NamedTuple):
-    vertices: Float[np.ndarray, "vertices 3"]
+    poses: Float[np.ndarray, "frames vertices 3"]
     rigidity: Float[np.ndarray, "vertices"] | None
     words: list[str]
 
 
-def _edited(shape: jd.Mesh, moves: Moves) -> _Result:
+def _edited(shape: jd.Mesh, moves: Moves, frames: int | None) -> _Result:
     began = time.perf_counter()
-    edit = patiently("editing", lambda: jd.laplacian_editing(shape, moves.handles, moves.targets))
-    return _Result(np.asarray(edit), None, [f"edited in {since(began)}"])
+
+    def edit() -> np.ndarray:
+        run = jd.laplacian_editor(shape, moves.handles)
+        return np.stack([np.asarray(run(targets)) for targets in moves.path(frames or 1)])
+
+    return _Result(patiently("editing", edit), None, [f"edited in {since(began)}"])
 
 
-def _deformed(shape: jd.Mesh, moves: Moves, settings: _Settings) -> _Result:
+def _deformed(shape: jd.Mesh, moves: Moves, settings: _Settings, frames: int | None) -> _Result:
     method, material, rings, steps, normals = settings
     began = time.perf_counter()
     cells = jd.spokes(shape) if method == Method.arap else jd.rings(shape, rings)
@@ -222,15 +233,37 @@ def _deformed(shape: jd.Mesh, moves: Moves, settings: _Settings) -> _Result:
     # Cells that only rotate have no strain, and so no use for a rigidity.
     values = material.at(problem) if own else np.zeros(shape.n_vertices)
     local = jd.Newton() if own else jd.RotationFit()
-    solution = patiently(
-        "deforming",
-        lambda: jd.deform(
-            problem, moves.targets, values, local=local, solver=solver, normals=normals
-        ),
-    )
-    energy, done = float(solution.energy[-1]), int(solution.steps)
-    words = [
-        f"energy {energy:.6g} after {done} steps in {since(began)}",
-        jd.Result[solution.result],
-    ]
-    return _Result(np.asarray(solution.vertices), values if own else None, words)
+    options: dict[str, Any] = {"local": local, "solver": solver, "normals": normals}
+    if frames is None:
+        run = lambda: jd.deform(problem, moves.targets, values, **options)  # noqa: E731
+        one = patiently("deforming", run)
+        energy, done = float(one.energy[-1]), int(one.steps)
+        words = [f"energy {energy:.6g} after {done} steps in {since(began)}", jd.Result[one.result]]
+        return _Result(np.asarray(one.vertices)[None], values if own else None, words)
+    path = moves.path(frames)
+    run = lambda tell: jd.deform_path(problem, path, values, progress=tell, **options)  # noqa: E731
+    all_ = counted("deforming", frames, run)
+    energy, done = float(all_.energy[-1, -1]), int(all_.steps.sum())
+    words = [f"energy {energy:.6g} in the last frame, after {done} steps in {since(began)}"]
+    words += list(_told(all_, frames))
+    return _Result(np.asarray(all_.vertices), values if own else None, words)
+
+
+def _told(path: jd.Solution, frames: int) -> Iterator[str]:
+    """Say how many frames ended how, and which are not as they should be."""
+    ok, flipped = np.asarray(path.ok), np.asarray(path.flipped) > 0
+    ends: dict[str, list[int]] = {}
+    for k in range(frames):
+        sentence = jd.Result[jax.tree.map(lambda x, k=k: x[k], path.result)]
+        ends.setdefault(sentence, []).append(k)
+    for sentence, which in ends.items():
+        named = "" if ok[which[0]] else f" ({_numbers(which)})"
+        yield f"{len(which)} of {frames} frames{named}: {sentence}"
+    if flipped.any():
+        which = np.flatnonzero(flipped).tolist()
+        yield f"{len(which)} of {frames} frames ({_numbers(which)}) have cells inside out"
+
+
+def _numbers(frames: list[int]) -> str:
+    """Return the numbers of the first frames, from 1, as their files have them."""
+    return ", ".join(str(k + 1) for k in frames[:5]) + (", ..." if len(frames) > 5 else "")

@@ -10,20 +10,6 @@ import jaxdeform as jd
 from jaxdeform._mesh.select import some_where
 
 
-class Moves(NamedTuple):
-    """The handles of a command."""
-
-    handles: Int[np.ndarray, "handles"]
-    targets: Float[np.ndarray, "handles 3"]
-    moved: Bool[np.ndarray, "handles"]
-    """False for a handle that stays where it is."""
-
-    def __str__(self) -> str:
-        """Return how many vertices were chosen."""
-        moved = int(self.moved.sum())
-        return f"fixed: {len(self.moved) - moved} vertices, moved: {moved} vertices"
-
-
 class Motion(NamedTuple):
     """The rigid motion of the moved vertices, as the options give it."""
 
@@ -43,6 +29,12 @@ class Motion(NamedTuple):
         if self.about and not self.rotate:
             raise jd.InputError("--about is the centre of a rotation: give --rotate AXIS DEGREES")
 
+    def part(self, share: float) -> "Motion":
+        """Return this share of the motion, from 0 to 1."""
+        rotate = self.rotate and (self.rotate[0], share * self.rotate[1])
+        x, y, z = self.translate or (0.0, 0.0, 0.0)
+        return Motion(rotate, self.about, (share * x, share * y, share * z))
+
     def of(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
         """Return where these points move to: rotated, then translated."""
         option = "--rotate"
@@ -56,9 +48,42 @@ class Motion(NamedTuple):
             raise jd.InputError(f"{option}: {error}") from error
 
 
+class Moves(NamedTuple):
+    """The handles of a command."""
+
+    handles: Int[np.ndarray, "handles"]
+    rest: Float[np.ndarray, "handles 3"]
+    targets: Float[np.ndarray, "handles 3"]
+    moved: Bool[np.ndarray, "handles"]
+    """False for a handle that stays where it is."""
+    motion: Motion | None
+    """Of the moved handles; None if a file gives the targets."""
+
+    def __str__(self) -> str:
+        """Return how many vertices were chosen."""
+        moved = int(self.moved.sum())
+        return f"fixed: {len(self.moved) - moved} vertices, moved: {moved} vertices"
+
+    def path(self, frames: int) -> Float[np.ndarray, "frames handles 3"]:
+        """Return the targets in even steps; the last ones are ``targets``.
+
+        A motion turns by even angles and shifts by even lengths. Targets of a file are reached on
+        straight lines.
+        """
+        return np.stack([self._after((k + 1) / frames) for k in range(frames)])
+
+    def _after(self, share: float) -> Float[np.ndarray, "handles 3"]:
+        if self.motion is None:
+            return (1 - share) * self.rest + share * self.targets
+        at = self.rest.copy()
+        at[self.moved] = self.motion.part(share).of(at[self.moved])
+        return at
+
+
 def moves_of_file(mesh: jd.Mesh, path: Path, motion: Path | None) -> Moves:
     handles, targets = jd.load_handles(path, mesh, motion)
-    return Moves(handles, targets, (targets != mesh.vertices[handles]).any(axis=1))
+    rest = mesh.vertices[handles]
+    return Moves(handles, rest, targets, (targets != rest).any(axis=1), None)
 
 
 def moves_by_place(mesh: jd.Mesh, fix: list[str], move: str | None, motion: Motion) -> Moves:
@@ -80,4 +105,4 @@ def moves_by_place(mesh: jd.Mesh, fix: list[str], move: str | None, motion: Moti
     grabbed = moved.mask[handles]
     targets = mesh.vertices[handles]
     targets[grabbed] = motion.of(targets[grabbed])
-    return Moves(handles, targets, grabbed)
+    return Moves(handles, mesh.vertices[handles], targets, grabbed, motion)

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import TextIO, TypeVar, cast
 
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 from jaxdeform._apps.mouth import Mouth
 from jaxdeform._errors import printable
@@ -21,23 +29,37 @@ Out = TypeVar("Out")
 
 
 def patiently(what: str, work: Callable[[], Out]) -> Out:
-    """Run work in another thread and show how long it takes.
+    """Run work in another thread and show how long it takes."""
+    columns = SpinnerColumn(), TextColumn(what, markup=False)
+    return _shown(what, None, columns, lambda tell: work())
 
-    While JAX computes, its thread does not receive Ctrl-C; the main thread, which waits, does.
-    """
+
+def counted(what: str, total: int, work: Callable[[Callable[[int, int], None]], Out]) -> Out:
+    """Run work in another thread and show how much of it is done, which the work tells."""
+    columns = TextColumn(what, markup=False), BarColumn(), MofNCompleteColumn()
+    return _shown(what, total, columns, work)
+
+
+def _shown(
+    what: str, total: int | None, columns: tuple[ProgressColumn, ...], work: Callable[..., Out]
+) -> Out:
+    # While JAX computes, its thread does not receive Ctrl-C; the main thread, which waits, does.
     outcome: Future[Out] = Future()
-
-    def run() -> None:
-        try:
-            outcome.set_result(work())
-        except BaseException as error:
-            outcome.set_exception(error)
-
-    columns = SpinnerColumn(), TextColumn(what, markup=False), TimeElapsedColumn()
     with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
+        *columns,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
     ) as bar:
-        bar.add_task(what, total=None)
+        task = bar.add_task(what, total=total)
+
+        def run() -> None:
+            try:
+                outcome.set_result(work(lambda done, _: bar.update(task, completed=done)))
+            except BaseException as error:
+                outcome.set_exception(error)
+
         threading.Thread(target=run, daemon=True).start()
         return outcome.result()
 

@@ -144,13 +144,11 @@ class _Last(NamedTuple):
         keeps what is left of rounding in a pause from being magnified.
 
         Iterations of QuasiNewton() for all frames of the bar, at rigidity_from_material 10, 0.2
-        and 0.01, from the last vertices / those and Laplacian editing of the motion / this:
-        twist of 180 degrees in 60 frames 1976, 2079, 3249 / 1819, 1852, 2946 / 619, 639, 1097; in
-        10 frames 501, 503, 775 / 471, 465, 725 / 324, 321, 491; bend of 90 degrees in 30 frames
-        810, 898, 1411 / 698, 727, 1123 / 497, 364, 582. Laplacian editing / this: twist by 90
-        degrees, pause and back 846, 1072, 1709 / 483, 557, 946; drag by a jittery hand 525, 679,
-        1002 / 500, 619, 919. The multiple always 1 takes 549, 713, 1043 there, and as many or more
-        elsewhere, unless the path is perfectly steady.
+        and 0.01. From the last vertices alone: twist of 180 degrees in 60 frames 1976, 2079, 3249;
+        jittery drag 667, 869, 1560. With Laplacian editing of the whole motion: 1819, 1852, 2946;
+        525, 657, 1146. This: 619, 639, 1097; 500, 620, 1083. (A multiple of 1 always: the same for
+        the twist, 549 for the drag at 10, and 764 instead of 568 for a twist with ease in and out
+        at 0.2.) docs/paths.md has more.
         """
         pull = targets - self.targets
         square = jnp.sum(self.pulled**2)
