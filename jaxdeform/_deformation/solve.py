@@ -93,7 +93,8 @@ def deform(
       drops the resistance to strain. Any `LocalStep` will do.
     - solver: ``QuasiNewton()`` (default: to convergence) or ``Alternating(steps=100)`` (as in the
       thesis; the default with normals).
-    - start: (vertices, 3) first guess; by default Laplacian editing (Sec. 4.1.2).
+    - start: (vertices, 3) first guess; by default Laplacian editing (Sec. 4.1.2). It decides which
+      minimum is found; `deform_path` follows the handles to another one.
     - handle_weights: other weights of the soft handles than in `precompute`, one or
       (handles,), from 0 to those of `precompute` (whose factor stays, and bounds the energy
       from above). Entries of hard handles are not read. Differentiable.
