@@ -90,7 +90,7 @@ def animate(
     """Draw poses one after the other into an animated GIF, which takes four seconds and repeats.
 
     Of very many poses it shows some, evenly chosen, with the last. **Raises** InputError as
-    :func:`render`.
+    `render`.
     """
     arrays = _read_poses(mesh, poses)
     (color,) = _read_values(mesh, [values], 1)

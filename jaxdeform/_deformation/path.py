@@ -41,7 +41,7 @@ def deform_path(
     turned by 360 degrees give it the rest shape. A path finds the minimum that the shape gets to
     when the handles go there in small steps. It is what a drag and an animation are.
 
-    A pure function of arrays, like :func:`deform`: it works under jit, vmap (over targets,
+    A pure function of arrays, like `deform`: it works under jit, vmap (over targets,
     rigidity, start), grad and jvp. All frames run in one compiled loop; another number of frames
     compiles anew. With ``Implicit()`` the derivatives of a frame are those of its own targets, not
     of the frames before: a minimum does not depend on where it was found from.
@@ -51,20 +51,20 @@ def deform_path(
 
     **Arguments**
 
-    - problem: from :func:`precompute`.
+    - problem: from `precompute`.
     - targets: (frames, handles, 3) positions of the handles in each frame, in the order of
       ``problem.handles``; an array or a list over frames. Steps of 5 to 10 degrees are small.
     - rigidity: a number or one per vertex (vertices,), the same in all frames. (For one that
       changes call ``deform`` with ``start=`` of the last frame.)
     - start: (vertices, 3) the shape before the first frame; by default the rest shape.
-    - local, solver, handle_weights, normals, adjoint, throw: as in :func:`deform`.
+    - local, solver, handle_weights, normals, adjoint, throw: as in `deform`.
     - progress: called with the number of frames done and of all frames, after each. The frames then
       run one by one, which compiles once for any number of them; not inside jit, vmap or grad.
 
-    **Returns** a :class:`Solution` whose arrays have a leading axis of frames, also ``result``,
+    **Returns** a `Solution` whose arrays have a leading axis of frames, also ``result``,
     ``ok`` and ``flipped``. ``jax.tree.map(lambda x: x[k], out)`` is the solution of frame k.
 
-    **Raises** InputError: as :func:`deform`; targets without a frame; progress while JAX traces.
+    **Raises** InputError: as `deform`; targets without a frame; progress while JAX traces.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
@@ -144,11 +144,11 @@ class _Last(NamedTuple):
         keeps what is left of rounding in a pause from being magnified.
 
         Iterations of QuasiNewton() for all frames of the bar, at rigidity_from_material 10, 0.2
-        and 0.01. From the last vertices alone: twist of 180 degrees in 60 frames 1976, 2079, 3249;
-        jittery drag 667, 869, 1560. With Laplacian editing of the whole motion: 1819, 1852, 2946;
-        525, 657, 1146. This: 619, 639, 1097; 500, 620, 1083. (A multiple of 1 always: the same for
-        the twist, 549 for the drag at 10, and 764 instead of 568 for a twist with ease in and out
-        at 0.2.) docs/paths.md has more.
+        and 0.01. From the last vertices alone: twist of 180 degrees in 60 frames 1976, 1019, 500;
+        jittery drag 667, 440, 244. With Laplacian editing of the whole motion: 1819, 964, 471; 525,
+        364, 200. This: 619, 407, 227; 500, 343, 192. (A multiple of 1 always, at 10: 614 for the
+        twist, 549 for the drag, and 658 instead of 513 for a twist with ease in and out.)
+        docs/paths.md has more.
         """
         pull = targets - self.targets
         square = jnp.sum(self.pulled**2)
