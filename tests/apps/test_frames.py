@@ -140,7 +140,7 @@ def test_what_one_frame_cannot_hold_keeps_no_other_from_being_written(deform, tm
 
 @pytest.mark.slow
 def test_frames_that_stop_early_or_turn_inside_out_are_counted(deform, monkeypatch):
-    hasty = jd.QuasiNewton(max_steps=3)
+    hasty = jd.QuasiNewton(max_steps=3, metric="stiffness")
     path = jd.deform_path
     monkeypatch.setattr(jd, "deform_path", lambda *a, **k: path(*a, **{**k, "solver": hasty}))
     code, out, _ = deform(*WHERE, *MOTION, "--rigidity", 1e-9, "--frames", 7, "-o", "out.obj")
