@@ -28,6 +28,7 @@ from jaxdeform._deformation.local_step import (
     Newton,
     RotationFit,
 )
+from jaxdeform._deformation.minimality import is_minimum
 from jaxdeform._deformation.path import deform_path
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
@@ -102,6 +103,7 @@ __all__ = [
     "geodesic_distances",
     "inspect",
     "inverse_distance_weights",
+    "is_minimum",
     "laplacian_editing",
     "laplacian_editor",
     "linear_blend_skinning",

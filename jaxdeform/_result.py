@@ -23,8 +23,8 @@ class Result(eqx.Enumeration):
         "allow more steps (or loosen the tolerance) if you rely on derivatives."
     )
     saddle = (
-        "At a saddle: the energy falls to both sides, and the descent left several saddles before. "
-        "Begin from a shape that is not symmetric (start), or allow more steps."
+        "At a saddle: the energy falls to both sides, and several descents from here did not end "
+        "in a minimum. Begin from another shape (start), or come by a path (deform_path)."
     )
     not_finite = (
         "Not finite: a local step failed, or the numbers overflowed. The cells at fault are those "

@@ -118,6 +118,17 @@ def good_calls(folder: Path) -> dict:
             },
         ),
         "dual_quaternion_skinning": (jd.dual_quaternion_skinning, SKIN),
+        "is_minimum": (
+            jd.is_minimum,
+            {
+                "problem": soft,
+                "targets": TARGETS,
+                "rigidity": np.ones(N),
+                "vertices": MESH.vertices,
+                "local": jd.Newton(),
+                "handle_weights": np.ones(5),
+            },
+        ),
         "energy": (
             jd.energy,
             {
@@ -249,7 +260,7 @@ OF_KIND = {
     "tolerance",
     "path": "path motion",
     "setting": "adjoint local solver",
-    "flag": "normals similarity throw",
+    "flag": "leave_saddles normals similarity throw",
     "axis": "axis along toward",
     "mesh": "mesh cage",
 }

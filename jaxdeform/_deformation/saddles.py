@@ -24,9 +24,9 @@ from jaxdeform._linalg.lanczos import lowest_mode
 from jaxdeform._linalg.lbfgs import Minimum, Settings
 
 # Steps of Lanczos where the sign does not show before.
-MOST = 32
-# Saddles that are left one after another, and by how far, in diagonals.
-_TURNS, _AWAY = 4, 0.02
+MOST = 64
+# Descents at most, and how far from a saddle the next one starts, in diagonals.
+_TURNS, _AWAY = 6, 0.02
 # Members of a batch that are looked at side by side: each takes 650 bytes a vertex.
 _AT_ONCE = 8
 
@@ -73,9 +73,11 @@ class _Way(NamedTuple):
     """A descent that goes on after saddles."""
 
     turn: Int[Array, ""]
-    start: Float[Array, "3 vertices"]
     best: Minimum
+    along: Float[Array, "3 vertices"]
+    """The way on from the best end, as long as the next try should go."""
     at_saddle: Bool[Array, ""]
+    """Whether the best end is known to be one."""
 
 
 def leave_saddles(
@@ -87,23 +89,27 @@ def leave_saddles(
 ) -> tuple[Minimum, Bool[Array, ""]]:
     """Descend; from a saddle go on along its direction of negative curvature.
 
-    ``size`` is that of the mesh. Returns where it ended, and whether that is a saddle still.
+    ``size`` is that of the mesh. Returns where it ended, and whether that is a saddle still. Where
+    a way on ends higher, as it may in a crumpled mesh, a shorter one is tried.
     """
     negative = -1e-5 if start.dtype == jnp.float64 else -1e-3
 
     def descend_on(way: _Way) -> _Way:
-        end = descend(way.start)
-        first, old = way.turn == 0, way.best.energy[way.best.steps]
-        lower = first | (end.energy[end.steps] < old - settings.tolerance * jnp.abs(old))
+        first = way.turn == 0
+        end = descend(jnp.where(first, start, way.best.p + way.along))
+        old, new = way.best.energy[way.best.steps], end.energy[end.steps]
+        margin = settings.tolerance * jnp.abs(old)
+        lower, higher = first | (new < old - margin), ~first & ~(new <= old + margin)
         value, along = curvature(end.p, end.transforms)
         longest = jnp.sqrt(jnp.max(jnp.sum(along**2, axis=0)))
-        away = end.p + along * (_AWAY * size / jnp.where(longest > 0, longest, 1.0))
+        along = along * (_AWAY * size / jnp.where(longest > 0, longest, 1.0))
         both = jax.tree.map(partial(jnp.where, first), end, _joined(way.best, end))
         best = jax.tree.map(partial(jnp.where, lower), both, way.best)
-        return _Way(way.turn + 1, away, best, lower & end.converged & (value < negative))
+        at_saddle = jnp.where(lower, end.converged & (value < negative), higher)
+        return _Way(way.turn + 1, best, jnp.where(lower, along, 0.2 * way.along), at_saddle)
 
     unknown = Minimum.unknown(start, settings)
-    begin = _Way(jnp.zeros((), jnp.int32), start, unknown, jnp.asarray(True))
+    begin = _Way(jnp.zeros((), jnp.int32), unknown, jnp.zeros_like(start), jnp.asarray(True))
     going = lambda way: way.at_saddle & (way.turn < _TURNS)  # noqa: E731
     end = jax.lax.while_loop(going, descend_on, begin)
     return end.best, end.at_saddle

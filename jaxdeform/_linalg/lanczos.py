@@ -22,7 +22,7 @@ def lowest_mode(
     H is symmetric, ``precondition`` is M^-1, positive definite. The value is that of x itself,
     ``x^T H x`` with ``x^T M x = 1``: never below the true one, so that a negative value proves that
     H has negative curvature. x is 0 where the value is not negative. It stops once the value is
-    negative, or twice as large as its error bound, or after ``most`` steps.
+    twice as large as its error bound, or after ``most`` steps.
 
     The vectors are not kept but made again for x, by a second run, so that memory does not grow
     with the steps. (They lose their orthogonality, which does no harm to the lowest mode.)
@@ -50,7 +50,7 @@ def lowest_mode(
 
     def known(run: "_Run") -> Array:
         error = run.state.beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
-        sure = (run.mu < 0.0) | (2.0 * error < run.mu) | ~jnp.isfinite(run.mu)
+        sure = ~(2.0 * error >= jnp.abs(run.mu))
         return (run.steps >= _LEAST) & sure | (run.steps >= most)
 
     at = jnp.zeros((), jnp.int32)
