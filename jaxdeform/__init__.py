@@ -1,5 +1,6 @@
 """jaxdeform: differentiable mesh deformation in JAX, every part with its own rigidity."""
 
+from jaxdeform._baselines.arap import arap, rc_arap
 from jaxdeform._baselines.cages import mean_value_coordinates
 from jaxdeform._baselines.laplacian_editing import (
     LaplacianEditor,
@@ -88,6 +89,7 @@ __all__ = [
     "ThesisEstimate",
     "Unrolled",
     "Verdict",
+    "arap",
     "bend",
     "bounded_biharmonic_weights",
     "cotangent_weights",
@@ -113,6 +115,7 @@ __all__ = [
     "load_skeleton",
     "mean_value_coordinates",
     "precompute",
+    "rc_arap",
     "render",
     "repair",
     "rigid_targets",

@@ -44,6 +44,13 @@ def good_calls(folder: Path) -> dict:
         "max_evaluations": 5,
     }
     fit = {**observed, "adjoint": jd.Implicit(), "progress": print}
+    rigid = {
+        "mesh": MESH,
+        "handles": HANDLES,
+        "targets": TARGETS,
+        "weights": np.ones(EDGES),
+        "start": MESH.vertices,
+    }
     edit = {
         "mesh": MESH,
         "handles": HANDLES,
@@ -159,6 +166,8 @@ def good_calls(folder: Path) -> dict:
         "geodesic_distances": (jd.geodesic_distances, {"mesh": MESH, "sources": [0, 1]}),
         "inspect": (jd.inspect, {"mesh": MESH}),
         "inverse_distance_weights": (jd.inverse_distance_weights, {**WEIGHTS, "power": 2.0}),
+        "arap": (jd.arap, rigid),
+        "rc_arap": (jd.rc_arap, {**rigid, "r": 1}),
         "laplacian_editing": (jd.laplacian_editing, {**edit, "targets": TARGETS}),
         "laplacian_editor": (jd.laplacian_editor, edit),
         "linear_blend_skinning": (jd.linear_blend_skinning, SKIN),

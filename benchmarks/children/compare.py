@@ -76,7 +76,7 @@ def descent(load: Load, rigidity: float) -> Job:
     out = jd.deform(problem, load.targets, rigidity, solver=exact, start=load.start)
     energy = np.asarray(out.energy)[: int(out.steps) + 1]
     steps = int(np.flatnonzero(energy <= energy.min() * (1 + NEAR))[0])
-    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0)
+    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0, leave_saddles=False)
     note = f"{steps} steps, minimum {energy.min():.6g}"
     return lambda: jd.deform(problem, load.targets, rigidity, solver=solver, start=load.start), note
 

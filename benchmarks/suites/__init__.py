@@ -15,6 +15,7 @@ from benchmarks.suites import (
     local_steps,
     memory,
     scaling,
+    softness,
     startup,
     thesis,
 )
@@ -23,6 +24,7 @@ SUITES: dict[str, Callable[[bool], Findings]] = {
     "iteration": iteration.run,
     "cactus": cactus.run,
     "convergence": convergence.run,
+    "softness": softness.run,
     "thesis": thesis.run,
     "local_steps": local_steps.run,
     "factors": factors.run,

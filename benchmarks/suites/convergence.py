@@ -82,7 +82,7 @@ def _our_descent(load: Workload, case: Case) -> Ours:
     energy = _energies(load, case.problem, case.rigidity, case.local)
     least = energy.min()
     steps = int(np.flatnonzero(energy <= least * (1 + NEAR))[0])
-    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0)
+    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0, leave_saddles=False)
 
     def run():
         return jd.deform(

@@ -28,7 +28,7 @@ def _against_thesis(load: Workload, rigidity: float, steps: int) -> list[Metric]
     reached = load.reduced_energy(problem, p, rigidity, jd.Newton())
     energy = np.asarray(jd.deform(problem, load.targets, rigidity, start=load.start).energy)
     needed = int(np.flatnonzero(energy <= reached)[0])
-    solver = jd.QuasiNewton(max_steps=max(1, needed), tolerance=0.0)
+    solver = jd.QuasiNewton(max_steps=max(1, needed), tolerance=0.0, leave_saddles=False)
 
     def ours():
         return jd.deform(problem, load.targets, rigidity, solver=solver, start=load.start)
