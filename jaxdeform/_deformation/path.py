@@ -1,7 +1,6 @@
 """A path: many deformations of one mesh, each of which starts from the one before."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -18,6 +17,7 @@ from jaxdeform._deformation.problem import Problem, System, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import Solution, descend, guess, without_derivative
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result
 
 
@@ -166,7 +166,7 @@ class _Last(NamedTuple):
 _SOUND = Result.converged, Result.steps_done, Result.step_limit
 
 
-@partial(jax.jit, static_argnames="how")
+@quick_jit(static=("how",), options=AS_FAST)
 def _follow(system: System, inputs: Inputs, last: _Last, how: Settings) -> tuple[_Last, Solution]:
     """Run all frames of ``inputs.targets`` (frames, 3, vertices), and return where they end."""
     system = without_derivative(system)

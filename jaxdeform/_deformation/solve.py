@@ -19,6 +19,7 @@ from jaxdeform._deformation.problem import Problem, System, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.verdict import inside_out, verdict
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, succeeded
 
 
@@ -170,7 +171,7 @@ def energy(
     return jnp.sum(p * stiff) + jnp.sum(cells)
 
 
-@partial(jax.jit, static_argnames="how")
+@quick_jit(static=("how",), options=AS_FAST)
 def _solve(
     system: System,
     inputs: Inputs,
