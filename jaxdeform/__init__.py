@@ -53,7 +53,8 @@ from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import Selection
 from jaxdeform._mesh.submesh import Submesh, submesh
-from jaxdeform._plotting import render
+from jaxdeform._plotting.animate import animate
+from jaxdeform._plotting.render import render, render_grid
 from jaxdeform._result import Result
 
 __version__ = "0.1.0"  # pyproject.toml reads it from here
@@ -89,6 +90,7 @@ __all__ = [
     "ThesisEstimate",
     "Unrolled",
     "Verdict",
+    "animate",
     "arap",
     "bend",
     "bounded_biharmonic_weights",
@@ -117,6 +119,7 @@ __all__ = [
     "precompute",
     "rc_arap",
     "render",
+    "render_grid",
     "repair",
     "rigid_targets",
     "rigid_transforms",

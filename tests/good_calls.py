@@ -59,6 +59,15 @@ def good_calls(folder: Path) -> dict:
         "similarity": False,
     }
     move = {"points": MESH.vertices, "degrees": 30.0}
+    drawn = {
+        "mesh": MESH,
+        "label": "rigidity",
+        "handles": HANDLES,
+        "moved": [1, 5],
+        "up": "y",
+        "edges": True,
+        "width": 64,
+    }
     return {
         "Alternating": (jd.Alternating, {"steps": 3, "tolerance": 1e-3}),
         "GradientDescent": (jd.GradientDescent, {"max_steps": 3}),
@@ -85,6 +94,17 @@ def good_calls(folder: Path) -> dict:
         ),
         "LaplacianEditor": (editor, {"targets": TARGETS}),
         "Submesh": (PIECE.reinsert, {"vertices": PIECE.mesh.vertices, "base": MESH.vertices}),
+        "animate": (
+            jd.animate,
+            {
+                **drawn,
+                "path": folder / "m.gif",
+                "poses": [MESH.vertices],
+                "values": np.ones(N),
+                "turn": 10.0,
+                "seconds": 1.0,
+            },
+        ),
         "bend": (jd.bend, {**move, "along": "y", "toward": "x"}),
         "bounded_biharmonic_weights": (
             jd.bounded_biharmonic_weights,
@@ -195,13 +215,23 @@ def good_calls(folder: Path) -> dict:
         "render": (
             jd.render,
             {
+                **drawn,
                 "path": folder / "m.png",
-                "mesh": MESH,
                 "poses": [MESH.vertices],
                 "titles": ["rest"],
                 "values": [np.ones(N)],
-                "label": "rigidity",
-                "width": 64,
+                "columns": 1,
+            },
+        ),
+        "render_grid": (
+            jd.render_grid,
+            {
+                **drawn,
+                "path": folder / "m.png",
+                "poses": [[MESH.vertices]],
+                "rows": ["r = 1"],
+                "columns": ["soft"],
+                "values": [[np.ones(N)]],
             },
         ),
         "repair": (jd.repair, {"mesh": MESH}),
@@ -263,18 +293,21 @@ OF_KIND = {
     "edge_weights handle_weights high low observed offset point points power rest rigidity "
     "rotations start targets transforms translations vertices weights",
     "indices": "faces group parts r",
-    "vertices": "free handles sources",
-    "count": "count history_length max_evaluations max_steps steps width",
-    "tolerance": "determined_within distance radius smoothness step_size target_noise threshold "
-    "tolerance",
+    "vertices": "free handles moved sources",
+    "count": "columns count history_length max_evaluations max_steps steps width",
+    "tolerance": "determined_within distance radius seconds smoothness step_size "
+    "target_noise threshold tolerance",
     "path": "path motion",
     "setting": "adjoint local solver",
-    "flag": "leave_saddles normals similarity throw",
-    "axis": "axis along toward",
+    "flag": "edges leave_saddles normals similarity throw",
+    "axis": "axis along toward up",
     "mesh": "mesh cage",
 }
 KINDS = {name: kind for kind, names in OF_KIND.items() for name in names.split()}
 KINDS_HERE = {
+    ("animate", "values"): "numbers",
+    ("render_grid", "columns"): "titles",
+    ("render_grid", "rows"): "titles",
     ("estimate_rigidity_thesis", "start"): "tolerance",
     ("inspect", "mesh"): "mesh-like",
     ("select.component", "vertices"): "vertices",

@@ -255,6 +255,7 @@ def wrong_values(kind: str, good, problem) -> dict:
         "dtype": lambda: NO_SETTING | {"half": np.float16, "integer": int, "name": "north"},
         "metric": lambda: {"none": None, "list": ["auto"], "word": "A", "array": MESH.vertices},
         "progress": lambda: {"text": "print", "number": 5, "mesh": MESH},
+        "turn": lambda: NO_SETTING | {"bool": True, "huge": 10**5000, "array": np.ones(2)},
         "label": lambda: {"none": None, "number": 5, "bytes": b"rigidity", "list": ["rigidity"]},
         "titles": lambda: NO_TEXTS,
         "values": lambda: (
@@ -277,7 +278,12 @@ class Unhashable(jd.QuasiNewton, jd.Newton, jd.Implicit):
 
 
 # Values that an argument may take, though their kind may not.
+PICTURES = ("animate", "render", "render_grid")
 ALLOWED = {
+    **{(name, "up"): {"none"} for name in PICTURES},  # guessed
+    # A broken pose is drawn as far as it goes, and named.
+    **{(name, "poses"): {"in a list: nan", "in a list: jax nan"} for name in PICTURES},
+    **{(name, "moved"): {"none", "empty mask", "empty selection"} for name in PICTURES},
     ("load_handles", "motion"): {"none"},
     ("select.mask", "mask"): {"nothing seen"},  # a selection may be empty
     ("select.within", "sources"): {"repeated"},

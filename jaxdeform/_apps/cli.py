@@ -19,7 +19,7 @@ from jaxdeform._apps.arguments import make_folder
 from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.estimating import estimate
 from jaxdeform._apps.talk import console, mouth, patiently, since
-from jaxdeform._plotting import check_picture_path
+from jaxdeform._plotting.files import check_picture_path
 
 app = typer.Typer(
     help="Deform triangle meshes whose parts differ in rigidity.",
@@ -120,8 +120,9 @@ def demo(
         out / "demo.png",
         mesh,
         [mesh.vertices, *poses],
-        titles=["rest", *materials],
+        titles=["rest", *(name.replace("-", " ") for name in materials)],
         values=[None, *materials.values()],
+        handles=handles,
     )
     console.print(f"wrote {out / 'demo.png'} and {len(materials)} PLY files")
 

@@ -167,7 +167,7 @@ def deform(
     for line in result.words:
         console.print(line)
     output.say_wrote()
-    output.draw(shape, result.poses, result.rigidity if material.varies else None)
+    output.draw(shape, moves, result.poses, result.rigidity if material.varies else None)
 
 
 def _read_moves(

@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxdeform as jd
+from jaxdeform._apps.moves import Moves
 from jaxdeform._apps.results import save_result
 from jaxdeform._apps.talk import console, say_wrote
 from jaxdeform._errors import printable
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
-from jaxdeform._plotting import animate, check_picture_path
+from jaxdeform._plotting.files import check_picture_path
 
 
 class Output(NamedTuple):
@@ -86,16 +87,24 @@ class Output(NamedTuple):
     def draw(
         self,
         shape: jd.Mesh,
+        moves: Moves,
         poses: Float[np.ndarray, "frames vertices 3"],
         rigidity: Float[np.ndarray, "vertices"] | None,
     ) -> None:
-        """Write the picture, if one is asked for, with the rigidity as colour."""
+        """Write the picture, if one is asked for, with the rigidity as colour and the handles."""
         if self.picture is None:
             return
+        handles, moved = moves.handles, moves.handles[moves.moved]
         if self._animated:
-            animate(self.picture, shape, poses, values=rigidity)
+            jd.animate(self.picture, shape, poses, values=rigidity, handles=handles, moved=moved)
         else:
-            ends = [shape.vertices, poses[-1]]
-            colors = [] if rigidity is None else [None, rigidity]
-            jd.render(self.picture, shape, ends, titles=["rest", "deformed"], values=colors)
+            jd.render(
+                self.picture,
+                shape,
+                [shape.vertices, poses[-1]],
+                titles=["rest", "deformed"],
+                values=[] if rigidity is None else [None, rigidity],
+                handles=handles,
+                moved=moved,
+            )
         say_wrote(self.picture)

@@ -22,7 +22,7 @@ from jaxdeform._mesh.words import (
 )
 
 # COFF, NOFF and the like add normals or colours after the position. 4OFF changes the position.
-_FIRST_WORD = re.compile(rb"(ST)?C?(N?)OFF", re.IGNORECASE)
+_FIRST_WORD = re.compile(rb"(ST)?(C?)(N?)OFF", re.IGNORECASE)
 
 
 def parse_off(path: Path, data: bytes) -> Parsed:
@@ -75,12 +75,26 @@ def rewrite_off(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
     filled = _filled(lines)
     first = _FIRST_WORD.fullmatch(content(lines[filled[0]])[0])
     rows = points
-    if first and first[2]:
+    if first and first[3]:
         rows = np.concatenate([points, np.round(vertex_normals(points, polygons), 6)], axis=1)
     begin = _body(lines, filled)
     for k, row in zip(filled[begin : begin + len(points)], rows.tolist(), strict=True):
         lines[k] = with_words(lines[k], 0, text_of(row))
     return b"".join(lines)
+
+
+def color_words(data: bytes) -> list[list[bytes]]:
+    """Return the words of each vertex that say its colour, in files that have colours."""
+    lines = data.splitlines()
+    filled = _filled(lines)
+    words = content(lines[filled[0]])
+    kind = _FIRST_WORD.fullmatch(words[0])
+    if not kind or not kind[2]:
+        return []
+    count = whole((words[1:] or content(lines[filled[1]]))[0])
+    begin = _body(lines, filled)
+    at = 6 if kind[3] else 3
+    return [content(lines[k])[at : at + 3] for k in filled[begin : begin + count]]
 
 
 def _filled(lines: list[bytes]) -> list[int]:

@@ -1,0 +1,135 @@
+"""Draw one view of a mesh into an array of pixels, by VTK, without a display."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from jaxdeform._plotting.camera import View
+from jaxdeform._plotting.surface import Surface
+
+FIXED, MOVED = "#39424e", "#e0245e"
+
+# Pixels are drawn this many times as fine, then averaged; up to the size that OpenGL allows.
+_FINER, _MOST = 2, 8192
+
+# Lights that go with the camera: where from, how strong.
+_LIGHTS = (((-0.5, 0.8, 1.0), 0.52), ((1.0, 0.3, 0.5), 0.30), ((0.0, 0.0, 1.0), 0.18))
+
+
+class Dots(NamedTuple):
+    """The handles: which vertices, and which of them move."""
+
+    vertices: Int[np.ndarray, "handles"]
+    moved: Bool[np.ndarray, "handles"]
+    """True for each that moves."""
+
+
+class Stage:
+    """A window in memory, in which one pose after the other is drawn."""
+
+    def __init__(self, surface: Surface, width: int, height: int, *, edges: bool) -> None:
+        """Open the window."""
+        import pyvista  # slow to import, and needed only here
+        from vtkmodules.vtkCommonCore import vtkLogger
+
+        # Without a display VTK falls back to drawing in memory, which is what we want: no warning.
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+        self.surface, self.edges = surface, edges
+        self.finer = _FINER if _FINER * max(width, height) <= _MOST else 1
+        size = [self.finer * width, self.finer * height]
+        # The decorators of pyvista hide self from pyright.
+        self.plotter: Any = pyvista.Plotter(window_size=size, off_screen=True, lighting="none")
+        self.plotter.set_background("white")
+        self.plotter.enable_parallel_projection()
+        for position, strength in _LIGHTS:
+            light = pyvista.Light(light_type="camera light", intensity=strength)
+            light.position = position
+            self.plotter.add_light(light)
+
+    def close(self) -> None:
+        """Close the window."""
+        self.plotter.close()
+
+    def draw(
+        self,
+        pose: Float[np.ndarray, "vertices 3"],
+        colors: Float[np.ndarray, "vertices 3"],
+        view: View,
+        dots: Dots | None,
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Return the picture of a pose. What is not finite is left out."""
+        plotter = self.plotter
+        plotter.clear_actors()
+        pose = _within_reach(pose, view)
+        self._add_surface(pose, colors)
+        if dots is not None:
+            self._add_dots(pose, dots)
+        far = 200 * view.depth
+        camera = plotter.camera
+        camera.focal_point = view.focus
+        camera.position = view.focus + far * view.toward
+        camera.up = view.above
+        aspect = plotter.window_size[1] / plotter.window_size[0]
+        camera.parallel_scale = max(view.half_height, view.half_width * aspect)
+        camera.clipping_range = (0.5 * far, 1.5 * far)
+        plotter.render()
+        image = np.asarray(plotter.screenshot(return_img=True))[..., :3]
+        if self.finer == 1:
+            return image
+        h, w = (n // self.finer for n in image.shape[:2])
+        blocks = image.reshape(h, self.finer, w, self.finer, 3)
+        return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    def _add_surface(self, pose: np.ndarray, colors: np.ndarray) -> None:
+        import pyvista
+
+        surface = self.surface
+        finite = np.asarray(np.isfinite(pose).all(axis=1))
+        whole = finite[surface.mesh.faces].all(axis=1)
+        if not whole.any():
+            return
+        points = np.where(finite[:, None], pose, 0.0)[surface.index]
+        drawn = pyvista.PolyData.from_regular_faces(points, surface.faces[whole])
+        drawn.point_data["colors"] = np.rint(255 * colors[surface.index]).astype(np.uint8)
+        drawn.point_data.active_normals = surface.normals(pose).astype(np.float32)
+        actor = self.plotter.add_mesh(
+            drawn,
+            scalars="colors",
+            rgb=True,
+            reset_camera=False,
+            show_edges=self.edges,
+            edge_color="#6b7683",
+            edge_opacity=0.55,
+            line_width=0.6 * self.finer,
+            ambient=0.50,
+            diffuse=0.78,
+            specular=0.10,
+            specular_power=12,
+        )
+        actor.prop.interpolation = "Phong"
+
+    def _add_dots(self, pose: np.ndarray, dots: Dots) -> None:
+        size = self.finer * max(3.0, self.plotter.window_size[0] / self.finer / 62)
+        for chosen, color in ((~dots.moved, FIXED), (dots.moved, MOVED)):
+            points = pose[dots.vertices[chosen]]
+            points = points[np.isfinite(points).all(axis=1)]
+            if len(points):
+                self.plotter.add_points(
+                    points,
+                    color=color,
+                    point_size=size,
+                    render_points_as_spheres=True,
+                    reset_camera=False,
+                    ambient=0.45,
+                    diffuse=0.65,
+                )
+
+
+def _within_reach(pose: np.ndarray, view: View) -> np.ndarray:
+    """Pull what flies off toward the middle until single precision can hold it, out of view."""
+    away = pose - view.focus
+    scale = np.abs(away).max(axis=1, keepdims=True)
+    most = 50 * view.depth
+    with np.errstate(invalid="ignore"):
+        return np.where(scale > most, view.focus + away / scale * most, pose)
