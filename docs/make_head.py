@@ -40,7 +40,6 @@ def poses() -> tuple[jd.Mesh, np.ndarray, np.ndarray, list[np.ndarray]]:
 
 if __name__ == "__main__":
     mesh, handles, constant, frames = poses()
-    np.savez("/tmp/pic/head.npz", frames=frames)
     jd.animate(
         Path(__file__).parent / "head.gif",
         mesh,

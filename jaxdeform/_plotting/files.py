@@ -13,6 +13,9 @@ from jaxtyping import UInt8
 from jaxdeform._errors import InputError
 from jaxdeform._mesh.writing import check_place, write_atomically
 
+# Ordered dithering (Bayer 1973), from -6 to 6 of 255.
+_PATTERN = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) * 0.8 - 6.0
+
 Picture = UInt8[np.ndarray, "_ _ 3"]
 
 
@@ -56,7 +59,11 @@ def _gif(images: Sequence[Picture], milliseconds: int) -> bytes:
     palette.putpalette(colors.tobytes())
     frames = []
     for image in images:
-        near = Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
+        # A fixed pattern of lighter and darker points hides the steps between colours.
+        tiles = [-(-n // 4) for n in image.shape[:2]]
+        mixed = image + np.tile(_PATTERN, tiles)[: image.shape[0], : image.shape[1], None]
+        mixed = Image.fromarray(mixed.clip(0, 255).astype(np.uint8))
+        near = mixed.quantize(palette=palette, dither=Image.Dither.NONE)
         # Pillow looks up colours by their first bits: white would become nearly white.
         index = np.where((image == 255).all(axis=2), 0, np.asarray(near)).astype(np.uint8)
         frames.append(Image.fromarray(index))
@@ -80,8 +87,7 @@ def _palette(images: Sequence[Picture]) -> UInt8[np.ndarray, "256 3"]:
     from PIL import Image
 
     pixels = np.concatenate([image.reshape(-1, 3) for image in images[:: len(images) // 12 + 1]])
-    # Each colour once: a narrow colour bar counts as much as a large, even surface.
-    pixels = np.append(np.unique(pixels // 4 * 4 + 2, axis=0), [[0, 0, 0]], axis=0).astype(np.uint8)
+    pixels = np.append(pixels[(pixels != 255).any(axis=1)], [[0, 0, 0]], axis=0).astype(np.uint8)
     few = Image.fromarray(pixels[None]).quantize(255, kmeans=1, dither=Image.Dither.NONE)
     found = np.array(few.getpalette(), np.uint8).reshape(-1, 3)
     out = np.full((256, 3), 255, np.uint8)
