@@ -12,13 +12,10 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
-import pyvista  # noqa: E402
-from PIL import Image  # noqa: E402
 
 import jaxdeform as jd  # noqa: E402
 
 HERE = Path(__file__).parent
-SOFT, STIFF = "#e8a33d", "#3d7fb8"
 
 
 # ---------------------------------------------------------------- the methods, on one mesh
@@ -58,9 +55,9 @@ def poses(mesh: jd.Mesh, kind: str) -> dict[str, np.ndarray]:
         out[name] = jd.deform(problem, targets, 0.0, local=jd.RotationFit()).vertices
     problem = jd.precompute(mesh, handles)
     for constant in (0.01, 100.0):
-        out[f"ours, lambda = {constant:g}"] = jd.deform(problem, targets, constant).vertices
+        out[f"ours, λ = {constant:g}"] = jd.deform(problem, targets, constant).vertices
     mixed = np.where(height < 0.5, 0.01, 100.0)
-    out["ours, lambda mixed"] = jd.deform(problem, targets, mixed).vertices
+    out["ours, λ mixed"] = jd.deform(problem, targets, mixed).vertices
     return {name: np.asarray(pose) for name, pose in out.items()}
 
 
@@ -100,63 +97,23 @@ def moved_cage(cage: jd.Mesh, motion) -> np.ndarray:
 # ---------------------------------------------------------------- pictures
 
 
-def sheet(path: Path, mesh: jd.Mesh, shown: dict[str, np.ndarray], columns: int, **look) -> None:
-    """Draw poses in a grid, all to one scale and from one side."""
-    rows = -(-len(shown) // columns)
-    size, height = look.get("size", 230), look.get("height", 230)
-    plotter = pyvista.Plotter(
-        shape=(rows, columns), window_size=[size * columns, height * rows], off_screen=True,
-        border=False,
-    )  # fmt: skip
-    together = np.concatenate(list(shown.values()))
-    middle = (together.min(axis=0) + together.max(axis=0)) / 2
-    for k, (name, pose) in enumerate(shown.items()):
-        plotter.subplot(k // columns, k % columns)
-        surface = pyvista.PolyData.from_regular_faces(pose, mesh.faces)
-        colour = look.get("colours", {}).get(name, "lightsteelblue")
-        kind = {"color": colour} if isinstance(colour, str) else {"scalars": colour, "rgb": True}
-        plotter.add_mesh(
-            surface,
-            show_edges=look.get("edges", True),
-            edge_color="slategray",
-            line_width=0.1,
-            ambient=0.3,
-            **kind,
-        )
-        plotter.add_text(name, position=(6, height - 18), font_size=7, color="black")
-        plotter.camera_position = [middle + look["eye"], middle, (0, 1, 0)]
-        plotter.camera.parallel_projection = True
-        plotter.camera.parallel_scale = look.get("zoom", 0.58) * np.ptp(together, axis=0).max()
-        plotter.renderer.ResetCameraClippingRange()
-    plotter.set_background("white")
-    image = plotter.screenshot(return_img=True)
-    plotter.close()
-    # 128 colours: a third of the bytes, and hardly a difference to the eye.
-    few = Image.fromarray(image).quantize(128, method=Image.Quantize.FASTOCTREE)
-    few.save(path, optimize=True)
-
-
 def bar_pictures() -> None:
     """The same bend and the same twist by every method (thesis Fig. 5.1)."""
     mesh = jd.shapes.bar()
-    far = 1000 * np.array([0.35, 0.25, 1.0])
+    y = mesh.vertices[:, 1]
+    halves = np.where(y < y.mean(), 0.01, 100.0)
     for kind in ("bend", "twist"):
         shown = poses(mesh, kind)
-        y = mesh.vertices[:, 1]
-        halves = np.where((y < y.mean())[:, None], rgb(SOFT), rgb(STIFF))
-        sheet(
+        jd.render(
             HERE / f"methods-{kind}.png",
             mesh,
-            shown,
-            6,
-            eye=far,
-            colours={"ours, lambda mixed": halves},
+            list(shown.values()),
+            titles=list(shown),
+            values=[halves if name.endswith("mixed") else None for name in shown],
+            columns=6,
+            edges=True,
+            width=260,
         )
-
-
-def rgb(colour: str) -> np.ndarray:
-    """Three bytes."""
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)
 
 
 def cactus_case():
@@ -172,38 +129,25 @@ def cactus_case():
 def cactus_picture() -> None:
     """Laplacian editing against ours, r and λ mixed (thesis Fig. 5.5)."""
     mesh, handles, targets, trunk = cactus_case()
-    held = np.isin(np.arange(mesh.n_vertices), handles)
     cells = jd.rings(mesh, np.where(trunk, 2, 1))
     problem = jd.precompute(mesh, handles, cells=cells)
     rigidity = np.where(trunk, 50.0, 0.01)
-    paint = np.where(trunk[:, None], rgb(STIFF), rgb(SOFT))
+    arap = jd.precompute(mesh, handles, cells=jd.spokes(mesh))
     shown = {
-        "rest, handles dark": mesh.vertices,
-        "blue: r = 2, lambda = 50": mesh.vertices,
-        "Laplacian editing": jd.laplacian_editing(mesh, handles, targets),
-        "ARAP": jd.deform(
-            jd.precompute(mesh, handles, cells=jd.spokes(mesh)),
-            targets,
-            0.0,
-            local=jd.RotationFit(),
-        ).vertices,
-        "ours, r and lambda mixed": jd.deform(problem, targets, rigidity).vertices,
+        "rest": (mesh.vertices, None),
+        "blue: r = 2, λ = 50": (mesh.vertices, rigidity),
+        "Laplacian editing": (jd.laplacian_editing(mesh, handles, targets), None),
+        "ARAP": (jd.deform(arap, targets, 0.0, local=jd.RotationFit()).vertices, None),
+        "ours, r and λ mixed": (jd.deform(problem, targets, rigidity).vertices, rigidity),
     }
-    sheet(
+    jd.render(
         HERE / "methods-cactus.png",
         mesh,
-        {name: np.asarray(pose) for name, pose in shown.items()},
-        5,
-        eye=100 * np.array([0.25, 0.15, 1.0]),
-        edges=False,
-        size=280,
-        height=310,
-        zoom=0.56,
-        colours={
-            "rest, handles dark": np.where(held[:, None], rgb("#40305a"), rgb("#c8d4e6")),
-            "blue: r = 2, lambda = 50": paint,
-            "ours, r and lambda mixed": paint,
-        },
+        [pose for pose, _ in shown.values()],
+        titles=list(shown),
+        values=[values for _, values in shown.values()],
+        handles=handles,
+        width=280,
     )
 
 
