@@ -104,10 +104,11 @@ def find_faults(mesh: Mesh, poses: Sequence[Pose]) -> list[Fault]:
     # The lower median: half of the poses may explode.
     middle = np.sort([center for center, _ in boxes], axis=0)[(len(boxes) - 1) // 2]
     usual = np.sort([size for _, size in boxes])[(len(boxes) - 1) // 2]
-    reach = [
-        float(np.linalg.norm(points / 4 - middle / 4, axis=1).max(initial=0.0)) / (usual / 8)
-        for points in finite
-    ]
+    with np.errstate(over="ignore"):
+        reach = [
+            float(np.linalg.norm(points / 4 - middle / 4, axis=1).max(initial=0.0)) / (usual / 8)
+            for points in finite
+        ]
     near = [len(points) > 0 and far < _FAR for points, far in zip(finite, reach, strict=True)]
     out = []
     for points, far, fits in zip(finite, reach, near, strict=True):

@@ -69,11 +69,11 @@ class View(NamedTuple):
     half_width: float
     half_height: float
     depth: float
-    """Nothing to draw is farther from the focus than this."""
+    """The diagonal of what is shown."""
 
 
 def find_view(
-    poses: list[Float[np.ndarray, "vertices 3"]], up: np.ndarray, turns: np.ndarray
+    poses: list[Float[np.ndarray, "_ 3"]], up: np.ndarray, turns: np.ndarray
 ) -> list[View]:
     """Return a view for each turn (in radians) about the up axis, all of the same rectangle.
 
@@ -99,7 +99,8 @@ def find_view(
     # Around an axis the rectangle must not wander, so all views share it.
     u = (lows[0::2].min(), highs[0::2].max())
     v = (lows[1::2].min(), highs[1::2].max())
-    depth = float(np.linalg.norm(high - low)) or 1.0
+    largest = float((high - low).max()) or 1.0
+    depth = largest * float(np.linalg.norm((high - low) / largest)) or 1.0
     margin = _MARGIN * max(u[1] - u[0], v[1] - v[0])
     half = [max((b - a) / 2, 0.05 * depth) + margin for a, b in (u, v)]
     return [

@@ -75,6 +75,11 @@ class Scale(NamedTuple):
         index = np.rint(np.where(known, place, 0) * (len(RAMP) - 1)).astype(int)
         return np.where(known[..., None], RAMP[index], rgb(UNKNOWN))
 
+    def bar(self, length: int) -> Float[np.ndarray, "length 3"]:
+        """Return the colours from the lowest number to the highest."""
+        place = np.linspace(0, 1, length) if self.low < self.high else np.full(length, 0.5)
+        return RAMP[np.rint(place * (len(RAMP) - 1)).astype(int)]
+
     def marks(self, closest: float) -> list[float]:
         """Return the numbers to write at the bar: both ends, and round ones between.
 

@@ -13,6 +13,9 @@ FIXED, MOVED = "#39424e", "#e0245e"
 # Pixels are drawn this many times as fine, then averaged; up to the size that OpenGL allows.
 _FINER, _MOST = 2, 8192
 
+# How far the eye is, and how far what flies off is drawn, in diagonals of what is shown.
+_EYE, _REACH = 200.0, 50.0
+
 # Lights that go with the camera: where from, how strong.
 _LIGHTS = (((-0.5, 0.8, 1.0), 0.52), ((1.0, 0.3, 0.5), 0.30), ((0.0, 0.0, 1.0), 0.18))
 
@@ -61,18 +64,18 @@ class Stage:
         """Return the picture of a pose. What is not finite is left out."""
         plotter = self.plotter
         plotter.clear_actors()
-        pose = _within_reach(pose, view)
+        # Single precision is enough near the origin and at size 1, whatever the mesh's unit.
+        pose = _within_reach((pose - view.focus) / view.depth)
         self._add_surface(pose, colors)
         if dots is not None:
             self._add_dots(pose, dots)
-        far = 200 * view.depth
         camera = plotter.camera
-        camera.focal_point = view.focus
-        camera.position = view.focus + far * view.toward
+        camera.focal_point = np.zeros(3)
+        camera.position = _EYE * view.toward
         camera.up = view.above
         aspect = plotter.window_size[1] / plotter.window_size[0]
-        camera.parallel_scale = max(view.half_height, view.half_width * aspect)
-        camera.clipping_range = (0.5 * far, 1.5 * far)
+        camera.parallel_scale = max(view.half_height, view.half_width * aspect) / view.depth
+        camera.clipping_range = (0.5 * _EYE, 1.5 * _EYE)
         plotter.render()
         image = np.asarray(plotter.screenshot(return_img=True))[..., :3]
         if self.finer == 1:
@@ -126,10 +129,8 @@ class Stage:
                 )
 
 
-def _within_reach(pose: np.ndarray, view: View) -> np.ndarray:
+def _within_reach(pose: np.ndarray) -> np.ndarray:
     """Pull what flies off toward the middle until single precision can hold it, out of view."""
-    away = pose - view.focus
-    scale = np.abs(away).max(axis=1, keepdims=True)
-    most = 50 * view.depth
+    scale = np.abs(pose).max(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return np.where(scale > most, view.focus + away / scale * most, pose)
+        return np.where(scale > _REACH, pose / scale * _REACH, pose)

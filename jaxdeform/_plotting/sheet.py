@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxdeform._plotting.color import RAMP, Scale, written
+from jaxdeform._plotting.color import Scale, written
 from jaxdeform._plotting.scene import FIXED, MOVED
 
 _INK, _FAINT, _WARN = "#1f2733", "#5a6675", "#b3123f"
@@ -156,8 +156,8 @@ class Sheet:
         pen = ImageDraw.Draw(image)
         top, thick = em, em
         pen.text((em, top + thick / 2), title, fill=_INK, font=font, anchor="lm")
-        ramp = np.rint(255 * RAMP[np.linspace(0, len(RAMP) - 1, length).round().astype(int)])
-        image.paste(Image.fromarray(np.repeat(ramp[None].astype(np.uint8), thick, 0)), (left, top))
+        ramp = np.rint(255 * scale.bar(length)).astype(np.uint8)
+        image.paste(Image.fromarray(np.repeat(ramp[None], thick, axis=0)), (left, top))
         for mark in scale.marks(closest=min(1.0, 3.2 * em / length)):
             x = left + float(scale.place(np.array(mark))) * (length - 1)
             pen.line([(x, top + thick), (x, top + thick + em // 4)], fill=_FAINT)

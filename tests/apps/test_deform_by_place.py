@@ -54,7 +54,7 @@ def test_the_command_of_the_readme(deform):
     # The picture is that of the same pose and the same colours.
     jd.render(
         "want.png", mesh, [mesh.vertices, np.asarray(want.vertices)],
-        titles=["rest", "deformed"], values=[None, rigidity],
+        titles=["rest", "deformed"], values=[None, rigidity], handles=handles,
     )  # fmt: skip
     drawn, expected = (np.asarray(Image.open(name), int) for name in ("out.png", "want.png"))
     assert drawn.shape == expected.shape
