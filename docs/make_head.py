@@ -17,7 +17,7 @@ import jaxdeform as jd  # noqa: E402
 FRAMES = 40
 
 
-def poses() -> tuple[jd.Mesh, np.ndarray, np.ndarray, list[np.ndarray]]:
+def poses() -> tuple[jd.Mesh, np.ndarray, np.ndarray, np.ndarray]:
     """Return the mesh, its handles, the constant of its material, and the poses of the film."""
     mesh = jd.shapes.cactus()
     top = jd.select.where(mesh, "v > 0.94")
@@ -28,14 +28,12 @@ def poses() -> tuple[jd.Mesh, np.ndarray, np.ndarray, list[np.ndarray]]:
     moved = top.mask[problem.handles]
     rest = mesh.vertices[problem.handles]
     center = np.array([0.0, 0.55 * mesh.vertices[:, 1].max(), 0.0])
-    out, start = [], mesh.vertices
-    for phase in 2 * np.pi * np.arange(FRAMES) / FRAMES:
-        targets = rest.copy()
+    targets = np.repeat(rest[None], FRAMES, axis=0)
+    for k, phase in enumerate(2 * np.pi * np.arange(FRAMES) / FRAMES):
         turned = jd.rotate(rest[moved], 65 * np.sin(phase), axis="z", center=center)
-        targets[moved] = jd.translate(turned, [0.0, 0.7 * np.cos(phase) ** 2, 0.0])
-        start = jd.deform(problem, targets, rigidity, start=start).vertices
-        out.append(np.asarray(start))
-    return mesh, problem.handles, constant, out
+        targets[k, moved] = jd.translate(turned, [0.0, 0.7 * np.cos(phase) ** 2, 0.0])
+    frames = jd.deform_path(problem, targets, rigidity).vertices
+    return mesh, problem.handles, constant, np.asarray(frames)
 
 
 if __name__ == "__main__":
@@ -45,7 +43,7 @@ if __name__ == "__main__":
         mesh,
         frames,
         values=constant,
-        label="rigidity",
+        label="material",
         handles=handles,
         seconds=3.2,
         width=400,

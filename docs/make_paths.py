@@ -3,12 +3,13 @@
 Needs the ``viewer`` extra. The figure is written beside this file.
 """
 
+from pathlib import Path
+
 import jax
 
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
-from make_methods import HERE, sheet  # noqa: E402
 
 import jaxdeform as jd  # noqa: E402
 
@@ -26,12 +27,19 @@ def turn_picture() -> None:
         path = jd.deform_path(problem, targets, rigidity)
         if not shown:
             at_once = jd.deform(problem, targets[-1], rigidity)
-            shown["deform, 360 degrees"] = np.asarray(at_once.vertices)
+            shown["deform, 360°"] = np.asarray(at_once.vertices)
         for degrees in (90, 180, 270, 360):
             if name == "stiff" or degrees > 180:
-                shown[f"{name}, path, {degrees}"] = np.asarray(path.vertices[degrees // 10 - 1])
-    far = 1000 * np.array([0.35, 0.25, 1.0])
-    sheet(HERE / "paths-turn.png", mesh, shown, len(shown), eye=far, height=300)
+                shown[f"{name}, path, {degrees}°"] = np.asarray(path.vertices[degrees // 10 - 1])
+    jd.render(
+        Path(__file__).parent / "paths-turn.png",
+        mesh,
+        list(shown.values()),
+        titles=list(shown),
+        columns=len(shown),
+        edges=True,
+        width=220,
+    )
 
 
 if __name__ == "__main__":
