@@ -27,7 +27,7 @@ _STEP = 6.0
 def animate(
     path: str | os.PathLike,
     mesh: Mesh,
-    poses: Sequence[ArrayLike],
+    poses: Sequence[ArrayLike] | ArrayLike,
     *,
     values: ArrayLike | str | None = None,
     label: str = "",

@@ -37,7 +37,7 @@ _MOST_COLUMNS = 5
 def render(
     path: str | os.PathLike,
     mesh: Mesh,
-    poses: Sequence[ArrayLike],
+    poses: Sequence[ArrayLike] | ArrayLike,
     *,
     titles: Sequence[str] = (),
     values: Sequence[ArrayLike | None] | str = (),
@@ -101,7 +101,7 @@ def render(
 def render_grid(
     path: str | os.PathLike,
     mesh: Mesh,
-    poses: Sequence[Sequence[ArrayLike]],
+    poses: Sequence[Sequence[ArrayLike]] | ArrayLike,
     rows: Sequence[str],
     columns: Sequence[str],
     *,
