@@ -94,21 +94,18 @@ def leave_saddles(
     """
     negative = -1e-5 if start.dtype == jnp.float64 else -1e-3
 
-    def nothing(p, _):
-        return jnp.zeros((), p.dtype), jnp.zeros_like(p)
-
     def descend_on(way: _Way) -> _Way:
         first = way.turn == 0
         end = descend(jnp.where(first, start, way.best.p + way.along))
         old, new = way.best.energy[way.best.steps], end.energy[end.steps]
         margin = settings.tolerance * jnp.abs(old)
         lower, higher = first | (new < old - margin), ~first & ~(new <= old + margin)
-        value, along = jax.lax.cond(end.converged, curvature, nothing, end.p, end.transforms)
+        value, along = curvature(end.p, end.transforms)
         longest = jnp.sqrt(jnp.max(jnp.sum(along**2, axis=0)))
         along = along * (_AWAY * size / jnp.where(longest > 0, longest, 1.0))
         both = jax.tree.map(partial(jnp.where, first), end, _joined(way.best, end))
         best = jax.tree.map(partial(jnp.where, lower), both, way.best)
-        at_saddle = jnp.where(lower, value < negative, higher)
+        at_saddle = jnp.where(lower, end.converged & (value < negative), higher)
         return _Way(way.turn + 1, best, jnp.where(lower, along, 0.2 * way.along), at_saddle)
 
     unknown = Minimum.unknown(start, settings)
