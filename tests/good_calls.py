@@ -44,6 +44,17 @@ def good_calls(folder: Path) -> dict:
         "max_evaluations": 5,
     }
     fit = {**observed, "adjoint": jd.Implicit(), "progress": print}
+    deformed = {
+        "problem": soft,
+        "rigidity": np.ones(N),
+        "local": jd.Newton(),
+        "solver": jd.QuasiNewton(),
+        "start": MESH.vertices,
+        "handle_weights": np.ones(5),
+        "normals": False,
+        "adjoint": jd.Implicit(),
+        "throw": False,
+    }
     rigid = {
         "mesh": MESH,
         "handles": HANDLES,
@@ -114,33 +125,17 @@ def good_calls(folder: Path) -> dict:
         "deform": (
             jd.deform,
             {
-                "problem": soft,
+                **deformed,
                 "targets": TARGETS,
-                "rigidity": np.ones(N),
-                "local": jd.Newton(),
-                "solver": jd.QuasiNewton(),
-                "start": MESH.vertices,
-                "handle_weights": np.ones(5),
-                "normals": False,
-                "adjoint": jd.Implicit(),
                 "rest": MESH.vertices,
                 "edge_weights": soft.cells.weights,
-                "throw": False,
             },
         ),
         "deform_path": (
             jd.deform_path,
             {
-                "problem": soft,
+                **deformed,
                 "targets": np.stack([MESH.vertices[HANDLES], TARGETS]),
-                "rigidity": np.ones(N),
-                "local": jd.Newton(),
-                "solver": jd.QuasiNewton(),
-                "start": MESH.vertices,
-                "handle_weights": np.ones(5),
-                "normals": False,
-                "adjoint": jd.Implicit(),
-                "throw": False,
                 "progress": print,
             },
         ),

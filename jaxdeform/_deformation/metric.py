@@ -129,15 +129,15 @@ def _key_on_host(out, *operands) -> None:
     own = [np.broadcast_to(x, (*out.shape[:-1], *x.shape[lead:])) for x in operands]
     for member in np.ndindex(out.shape[:-1]):
         always, rigidity, *arrays = (x[member] for x in own)
-        moments = arrays[5]
+        parts = _Parts.of(arrays)
         usable = bool(np.isfinite(rigidity).all() and (rigidity >= 0).all())
-        if usable and (always or _is_soft(rigidity, moments)):
+        if usable and (always or _is_soft(rigidity, parts.moments)):
             digest = hashlib.blake2b(digest_size=16)
-            for array in (_rounded_up(rigidity), arrays[0], *arrays[5:]):
+            for array in (_rounded_up(rigidity), parts.key, parts.moments, *parts.covariance):
                 digest.update(np.ascontiguousarray(array).data)
             out[member] = np.frombuffer(digest.digest(), np.uint32)
         else:
-            out[member] = arrays[0]
+            out[member] = parts.key
 
 
 def _is_soft(rigidity: np.ndarray, moments: np.ndarray) -> bool:
@@ -184,8 +184,7 @@ def _solve_columns(out, given, columns) -> None:
         factor = factors.get(parts.key, parts.stiffness, columns.dtype)
     else:
         factor = factors.find(key, columns.dtype, partial(_make, rigidity, parts, columns.dtype))
-    if columns.size:
-        factor.solve(np.require(columns, requirements=["C", "W"]), out)
+    factor.solve(columns, out)
 
 
 def _make(rigidity: np.ndarray, parts: _Parts, dtype: np.dtype) -> HostFactor:

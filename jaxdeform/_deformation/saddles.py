@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._deformation.metric import Metric, apply_metric
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._linalg.batching import spread_over_members
 from jaxdeform._linalg.lanczos import lowest_mode
 from jaxdeform._linalg.lbfgs import Minimum, Settings
 
@@ -59,10 +60,7 @@ def lowest_curvature(
 
     @look.def_vmap
     def look_at_some(size, is_batched, system, own):
-        if any(jax.tree.leaves(is_batched[0])):
-            raise NotImplementedError("vmap over problems: they differ in structure; use a loop")
-        spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
-        own = jax.tree.map(spread, own, is_batched[1])
+        own = spread_over_members(size, is_batched[0], is_batched[1], own)
         each = partial(look.fun, system)
         return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE)), (True, True)
 

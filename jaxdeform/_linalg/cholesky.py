@@ -165,8 +165,7 @@ def _solve_columns(out: np.ndarray, matrix: list[np.ndarray], columns: np.ndarra
         out[...] = 0
         return
     factor = factors.get(key, Matrix(*content), columns.dtype)
-    if columns.size:
-        factor.solve(np.require(columns, requirements=["C", "W"]), out)
+    factor.solve(columns, out)
 
 
 _host_solve = HostFunction("jaxdeform_cholesky_solve", _solve_on_host, installed_interface())

@@ -29,16 +29,16 @@ def conjugate_gradients(
     doi:10.6028/jres.049.044.
     """
     z = precondition(right)
-    size = _dot(right, z)
+    size = dot(right, z)
     goal = tolerance**2 * size
 
     def step(state):
         count, x, r, p, square = state
         hp = multiply(p)
-        alpha = square / _dot(p, hp)
+        alpha = square / dot(p, hp)
         r = r - alpha * hp
         z = precondition(r)
-        new = _dot(r, z)
+        new = dot(r, z)
         return count + 1, x + alpha * p, r, z + (new / square) * p, new
 
     def unsolved(state):
@@ -50,5 +50,6 @@ def conjugate_gradients(
     return x, jnp.sqrt(square / jnp.where(size > 0, size, 1.0))
 
 
-def _dot(u: Vectors, v: Vectors) -> Float[Array, ""]:
+def dot(u: Vectors, v: Vectors) -> Float[Array, ""]:
+    """Return the inner product."""
     return jnp.sum(u * v)

@@ -133,9 +133,11 @@ class HostFactor(NamedTuple):
         return int(entries * (_FACTOR_BYTES * np.log2(n + 1) + _MATRIX_BYTES))
 
     def solve(self, right: np.ndarray, out: np.ndarray) -> None:
-        """Solve for columns (n, k)."""
-        with self.lock:
-            self.solver.solve(right, out)
+        """Solve for columns (n, k), of any layout and number."""
+        if right.size:
+            right = np.require(right, requirements=["C", "W"])
+            with self.lock:
+                self.solver.solve(right, out)
 
 
 class _Entry:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-Vectors = Float[Array, "3 v"]
+from jaxdeform._linalg.conjugate_gradients import Vectors, dot
 
 
 def lowest_mode(
@@ -31,7 +31,7 @@ def lowest_mode(
     and integral operators" (1950), doi:10.6028/jres.045.026.
     """
     first = precondition(start)
-    size = jnp.sqrt(_dot(start, first))
+    size = jnp.sqrt(dot(start, first))
     zero, none = jnp.zeros((), start.dtype), jnp.zeros(most, start.dtype)
     begin = _State(start / size, first / size, jnp.zeros_like(start), zero)
 
@@ -39,10 +39,10 @@ def lowest_mode(
         k, state, *_ = run
         x = run.x + weights[k] * state.z
         w = multiply(state.z) - state.beta * state.before
-        value = _dot(w, state.z)
+        value = dot(w, state.z)
         w = w - value * state.q
         z = precondition(w)
-        beta = jnp.sqrt(jnp.maximum(_dot(w, z), 0.0))
+        beta = jnp.sqrt(jnp.maximum(dot(w, z), 0.0))
         inverse = jnp.where(beta > 0, 1.0 / jnp.where(beta > 0, beta, 1.0), 0.0)
         after = _State(w * inverse, z * inverse, state.q, beta)
         alphas, betas = run.alphas.at[k].set(value), run.betas.at[k].set(beta)
@@ -94,10 +94,6 @@ def _lowest(alphas, betas, steps) -> tuple[Float[Array, ""], Float[Array, "most"
     off = jnp.where(done[1:] & (betas[:-1] > 0), betas[:-1], 0.0)
     values, vectors = jnp.linalg.eigh(jnp.diag(diagonal) + jnp.diag(off, 1) + jnp.diag(off, -1))
     return values[0], jnp.where(done, vectors[:, 0], 0.0)
-
-
-def _dot(u: Vectors, v: Vectors) -> Float[Array, ""]:
-    return jnp.sum(u * v)
 
 
 # The first values say little.

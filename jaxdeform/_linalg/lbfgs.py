@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._linalg.batching import spread_over_members
 from jaxdeform._linalg.cholesky import has_accelerator
 from jaxdeform._linalg.xla import after_reads, without_fusion
 
@@ -113,10 +114,7 @@ def minimize(
 
     @batch.def_vmap
     def larger_batch(size, is_batched, system, *own):
-        if any(jax.tree.leaves(is_batched[0])):
-            raise NotImplementedError("vmap over problems: they differ in structure; use a loop")
-        spread = lambda x, is_: x if is_ else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
-        own = jax.tree.map(spread, own, tuple(is_batched[1:]))
+        own = spread_over_members(size, is_batched[0], tuple(is_batched[1:]), own)
         each = own[-1].shape[1]
         flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
         out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), batch(system, *flat))

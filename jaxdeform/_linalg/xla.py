@@ -5,13 +5,15 @@ hides a fact from the compiler instead. tests/linalg/test_xla.py reads the compi
 fails once XLA sees through one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, wraps
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from jaxdeform._arrays import is_concrete
 
 
 def total(x: Float[Array, "*shape"], batch: int | None = None) -> Float[Array, "*batch"]:
@@ -55,7 +57,7 @@ QUICK = {**AS_FAST, "xla_backend_optimization_level": 1}
 
 
 def quick_jit(
-    static: tuple[str, ...], options: dict[str, bool | int] = QUICK
+    static: tuple[str, ...], options: Mapping[str, bool | int] = QUICK
 ) -> Callable[[Callable], Callable]:
     """Return a decorator like ``jax.jit``, for programs at top level: they compile sooner.
 
@@ -82,8 +84,8 @@ def quick_jit(
 
 def _is_at_top(arguments: tuple) -> bool:
     """Whether JAX is not tracing: it takes compiler options nowhere else."""
-    leaves = [*jax.tree.leaves(arguments), jnp.zeros(())]  # the last is one inside jit
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+    leaves = [*jax.tree.leaves(arguments), jnp.zeros(())]  # the last is traced inside jit
+    return all(map(is_concrete, leaves))
 
 
 @cache
