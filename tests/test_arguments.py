@@ -288,6 +288,7 @@ ALLOWED = {
     ("select.mask", "mask"): {"nothing seen"},  # a selection may be empty
     ("select.within", "sources"): {"repeated"},
     ("rings", "r"): {"too large for memory", "largest"},  # cells reach as far as the mesh
+    ("rc_arap", "r"): {"too large for memory", "largest"},  # it is that of rings
 }
 
 
