@@ -1,5 +1,6 @@
 """jaxdeform: differentiable mesh deformation in JAX, every part with its own rigidity."""
 
+from jaxdeform._apps.compilation_cache import enable_compilation_cache
 from jaxdeform._baselines.arap import arap, rc_arap
 from jaxdeform._baselines.cages import mean_value_coordinates
 from jaxdeform._baselines.laplacian_editing import (
@@ -98,6 +99,7 @@ __all__ = [
     "deform",
     "deform_path",
     "dual_quaternion_skinning",
+    "enable_compilation_cache",
     "energy",
     "estimate_rigidity",
     "estimate_rigidity_field",

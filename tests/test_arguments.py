@@ -39,6 +39,7 @@ NOT_CALLED = {
     "ThesisEstimate",
     "Verdict",
 }
+NOT_CALLED |= {"enable_compilation_cache"}  # sets the whole process: apps/test_compilation_cache.py
 NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
 # What the text may call an argument instead of its name.
 SAID = {"handles": "handle", "sources": "source", "weights": "weight", "distances": "distance"}

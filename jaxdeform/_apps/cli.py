@@ -1,10 +1,12 @@
 """The command line: ``jaxdeform demo | inspect | deform | estimate``."""
 
+import contextlib
 import errno
 import os
 import signal
 import sys
 import time
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -38,9 +40,23 @@ def _interrupt(*_) -> None:
 
 
 @app.callback()
-def compute_in_double_precision() -> None:
-    """Turn on float64 before a command runs, because files are read and written in float64."""
-    jax.config.update("jax_enable_x64", True)
+def set_up(
+    cache: Annotated[
+        bool,
+        typer.Option(
+            "--cache/--no-cache",
+            help="Keep compiled programs for the next run, in the user's cache folder or in that "
+            "of JAXDEFORM_CACHE_DIR.",
+        ),
+    ] = True,
+) -> None:
+    """Set up the process before a command runs."""
+    jax.config.update("jax_enable_x64", True)  # files are read and written in float64
+    if cache:
+        # Without a folder, or with a damaged one, programs are compiled as if there were none.
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+        with contextlib.suppress(jd.InputError):
+            jd.enable_compilation_cache()
 
 
 def main() -> None:
@@ -48,7 +64,7 @@ def main() -> None:
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
         try:
-            app()
+            app(_with_cache_first(sys.argv[1:]))
         finally:
             mouth.flush()
     except SystemExit as end:
@@ -71,6 +87,11 @@ def main() -> None:
         os._exit(130)  # do not wait for the worker thread
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _with_cache_first(words: list[str]) -> list[str]:
+    """Return the arguments; ``--no-cache``, which every command takes, before the command."""
+    return sorted(words, key=lambda word: word not in ("--cache", "--no-cache"))
 
 
 def _tell_failure() -> None:
