@@ -24,6 +24,8 @@ def lowest_mode(
     H has negative curvature. x is 0 where the value is not negative. It stops once the value is
     twice as large as its error bound, or after ``most`` steps.
 
+    The tridiagonal matrix is looked at after 4, 8, 12, 18, 27, 40 and 60 steps.
+
     The vectors are not kept but made again for x, by a second run, so that memory does not grow
     with the steps. (They lose their orthogonality, which does no harm to the lowest mode.)
 
@@ -46,21 +48,30 @@ def lowest_mode(
         inverse = jnp.where(beta > 0, 1.0 / jnp.where(beta > 0, beta, 1.0), 0.0)
         after = _State(w * inverse, z * inverse, state.q, beta)
         alphas, betas = run.alphas.at[k].set(value), run.betas.at[k].set(beta)
-        return _Run(k + 1, after, alphas, betas, x, *_lowest(alphas, betas, k + 1))
+        return run._replace(steps=k + 1, state=after, alphas=alphas, betas=betas, x=x)
 
     def known(run: "_Run") -> Array:
-        error = run.state.beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
-        sure = ~(2.0 * error >= jnp.abs(run.mu))
-        return (run.steps >= _LEAST) & sure | (run.steps >= most)
+        beta = run.state.beta
+        error = beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
+        sure = ~(2.0 * error >= jnp.abs(run.mu)) & (run.steps > 0)
+        return sure & ((run.steps >= _LEAST) | (beta == 0.0)) | (run.steps >= most)
 
     at = jnp.zeros((), jnp.int32)
     nothing = _Run(at, begin, none, none, jnp.zeros_like(start), zero, none)
 
     def again(carried):
         turn, old = carried
+
+        def look(run: "_Run") -> "_Run":
+            soon = jnp.minimum(run.steps + jnp.maximum(_LEAST, run.steps // 2), most)
+            until = jnp.where(turn == 0, soon, old.steps)
+            more = lambda run: (run.steps < until) & ((run.state.beta > 0.0) | (run.steps == 0))  # noqa: E731
+            run = jax.lax.while_loop(more, partial(step, old.weights), run)
+            mu, weights = _lowest(run.alphas, run.betas, run.steps)
+            return run._replace(mu=mu, weights=weights)
+
         ended = lambda run: jnp.where(turn == 0, known(run), run.steps >= old.steps)  # noqa: E731
-        go_on = lambda run: ~ended(run)  # noqa: E731
-        return turn + 1, jax.lax.while_loop(go_on, partial(step, old.weights), nothing)
+        return turn + 1, jax.lax.while_loop(lambda run: ~ended(run), look, nothing)
 
     wanted = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
     turn, run = jax.lax.while_loop(wanted, again, (at, nothing))
@@ -89,12 +100,49 @@ class _Run(NamedTuple):
 
 
 def _lowest(alphas, betas, steps) -> tuple[Float[Array, ""], Float[Array, "most"]]:
+    """Return the lowest eigenvalue and its vector of the tridiagonal matrix of the steps done.
+
+    By Sturm's criterion, for many shifts at once, then by inverse iteration. (LAPACK's dense solver
+    took 12 ms for 64 steps where other processes used the cores, as long as 30 products.)
+    """
     done = jnp.arange(alphas.shape[0], dtype=steps.dtype) < steps
-    diagonal = jnp.where(done, alphas, 1e3 * (1.0 + jnp.max(jnp.abs(alphas))))
     off = jnp.where(done[1:] & (betas[:-1] > 0), betas[:-1], 0.0)
-    values, vectors = jnp.linalg.eigh(jnp.diag(diagonal) + jnp.diag(off, 1) + jnp.diag(off, -1))
-    return values[0], jnp.where(done, vectors[:, 0], 0.0)
+    before, after = jnp.append(0.0, off), jnp.append(off, 0.0)
+    low = jnp.min(jnp.where(done, alphas - before - after, jnp.inf))
+    high = jnp.min(jnp.where(done, alphas, jnp.inf))
+    limits = jnp.finfo(low.dtype)
+    low = low - 1e-3 * (high - low) - 100.0 * limits.eps * jnp.abs(high) - limits.tiny
+    diagonal = jnp.where(done, alphas, high + 1.0)  # the rest is another matrix beside it
+    shares = jnp.arange(_SHIFTS, dtype=low.dtype) / _SHIFTS
+
+    def pivots(shifts: Array) -> Array:
+        def next_(pivot, row):
+            pivot = row[0] - shifts - row[1] ** 2 / pivot
+            return pivot, pivot
+
+        first = jnp.ones_like(shifts)
+        return jax.lax.scan(next_, first, (diagonal, before), unroll=8)[1]
+
+    def narrow(_, ends):
+        low, step = ends
+        below = jnp.all(pivots(low + step * shares) > 0.0, axis=0)
+        # The first shift is below by construction, and rounding must not move it.
+        return low + step * jnp.max(jnp.where(below, shares, 0.0)), step / _SHIFTS
+
+    low, _ = jax.lax.fori_loop(0, _PASSES, narrow, (low, high - low))
+    pivot = pivots(low)
+
+    def solved(x: Array) -> Array:
+        down = lambda y, row: ((row[0] - row[1] * y) / row[2],) * 2  # noqa: E731
+        _, y = jax.lax.scan(down, jnp.zeros_like(low), (x, before, pivot), unroll=8)
+        up = lambda z, row: (row[0] - row[1] * z,) * 2  # noqa: E731
+        _, z = jax.lax.scan(up, jnp.zeros_like(low), (y, after / pivot), reverse=True, unroll=8)
+        return z / jnp.sqrt(jnp.sum(z**2))
+
+    return low, solved(solved(jnp.where(done, 1.0, 0.0)))
 
 
+# Shifts at once, and how often: the eigenvalue is known to 1e-13 of the spectrum.
+_SHIFTS, _PASSES = 128, 6
 # The first values say little.
 _LEAST = 4

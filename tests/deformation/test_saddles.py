@@ -9,7 +9,6 @@ import pytest
 import jaxdeform as jd
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.saddles import lowest_curvature
-from jaxdeform._linalg.lanczos import lowest_mode
 
 STAY = jd.QuasiNewton(leave_saddles=False)
 
@@ -19,37 +18,6 @@ def pushed(bar, bar_problem):
     """The bar pushed together by 30 of its 151 units: it buckles."""
     hold = bar.vertices[bar_problem.handles]
     return hold - np.where(hold[:, 1:2] > 75, [[0.0, 30.0, 0.0]], 0.0)
-
-
-def lowest(n: int, steps: int, shift: float):
-    """Return what some steps of Lanczos say of random matrices H and M, and the truth."""
-    rng = np.random.default_rng(n)
-    spread = np.linspace(0.0, 2.0, 3 * n)
-    spread[0] = shift
-    half = rng.standard_normal((3 * n, 3 * n)) + 4.0 * np.sqrt(n) * np.eye(3 * n)
-    mass = half @ half.T
-    basis = np.linalg.qr(rng.standard_normal((3 * n, 3 * n)))[0]
-    hessian = half @ (basis * spread) @ basis.T @ half.T
-    inverse = np.linalg.inv(mass)
-    shaped = lambda a: lambda x: (jnp.asarray(a) @ x.ravel()).reshape(x.shape)  # noqa: E731
-    start = jnp.asarray(rng.standard_normal((3, n)))
-    value, x = lowest_mode(shaped(hessian), shaped(inverse), start, steps)
-    return float(value), np.asarray(x).ravel(), hessian, mass
-
-
-def test_lanczos_finds_a_negative_mode():
-    value, x, hessian, mass = lowest(40, 40, -0.5)
-    assert -0.5 <= value < 0.0
-    np.testing.assert_allclose(x @ hessian @ x, value, rtol=1e-6)
-    np.testing.assert_allclose(x @ mass @ x, 1.0, rtol=1e-6)
-
-
-@pytest.mark.parametrize("steps", [1, 2, 5, 12])
-def test_lanczos_never_promises_too_much(steps):
-    """Its value is that of a vector, so never below the lowest one."""
-    for shift in (-0.3, 0.2):
-        assert lowest(30, steps, shift)[0] >= min(shift, 0.0) - 1e-9
-    assert not lowest(30, steps, 0.2)[1].any()
 
 
 def test_the_curvature_is_that_of_the_energy(bar, bar_problem, pushed):
