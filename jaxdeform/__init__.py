@@ -21,6 +21,7 @@ from jaxdeform._baselines.skinning_weights import (
 )
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
+from jaxdeform._deformation.batch import deform_batch, deform_in_chunks
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.local_step import (
     LBFGS,
@@ -97,6 +98,8 @@ __all__ = [
     "bounded_biharmonic_weights",
     "cotangent_weights",
     "deform",
+    "deform_batch",
+    "deform_in_chunks",
     "deform_path",
     "dual_quaternion_skinning",
     "enable_compilation_cache",

@@ -63,3 +63,17 @@ def succeeded(result: Result) -> Bool[Array, "*batch"]:
     """Return whether a computation ended as it should."""
     good = Result.steps_done, Result.converged, Result.fitted, Result.settled
     return reduce(operator.or_, (result == member for member in good))
+
+
+# Equinox does not list the members.
+MEMBERS = (
+    *("steps_done", "converged", "step_limit", "saddle", "not_finite", "bad_input"),
+    *("out_of_proportion", "fitted", "unexplained", "unsettled", "settled", "evaluation_limit"),
+    "fit_not_finite",
+)
+assert len(MEMBERS) == len(Result)
+
+
+def name_of(result: Result) -> str:
+    """Return the name of a member."""
+    return next(name for name in MEMBERS if bool(result == getattr(Result, name)))

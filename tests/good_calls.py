@@ -55,6 +55,8 @@ def good_calls(folder: Path) -> dict:
         "adjoint": jd.Implicit(),
         "throw": False,
     }
+    many = {k: v for k, v in deformed.items() if k not in ("adjoint", "throw")}
+    many |= {"targets": np.stack([TARGETS, TARGETS]), "rigidity": np.ones((2, N)), "memory": 10**6}
     rigid = {
         "mesh": MESH,
         "handles": HANDLES,
@@ -131,6 +133,8 @@ def good_calls(folder: Path) -> dict:
                 "edge_weights": soft.cells.weights,
             },
         ),
+        "deform_batch": (jd.deform_batch, {**many, "progress": print, "throw": False}),
+        "deform_in_chunks": (jd.deform_in_chunks, many),
         "deform_path": (
             jd.deform_path,
             {
@@ -289,7 +293,7 @@ OF_KIND = {
     "rotations start targets transforms translations vertices weights",
     "indices": "faces group parts r",
     "vertices": "free handles moved sources",
-    "count": "columns count history_length max_evaluations max_steps steps width",
+    "count": "columns count history_length memory max_evaluations max_steps steps width",
     "tolerance": "determined_within distance radius seconds smoothness step_size "
     "target_noise threshold tolerance",
     "path": "path motion",

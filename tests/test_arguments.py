@@ -279,12 +279,20 @@ class Unhashable(jd.QuasiNewton, jd.Newton, jd.Implicit):
 
 
 # Values that an argument may take, though their kind may not.
+BATCHES = ("deform_batch", "deform_in_chunks")
 PICTURES = ("animate", "render", "render_grid")
 ALLOWED = {
     **{(name, "up"): {"none"} for name in PICTURES},  # guessed
     # A broken pose is drawn as far as it goes, and named.
     **{(name, "poses"): {"in a list: nan", "in a list: jax nan"} for name in PICTURES},
     **{(name, "moved"): {"none", "empty mask", "empty selection"} for name in PICTURES},
+    **{(name, "memory"): {"2**31"} for name in BATCHES},
+    # In a batch only the member is at fault: its result says so.
+    **{
+        (name, argument): {"nan", "jax nan"}
+        for name in BATCHES
+        for argument in ("targets", "rigidity", "start")
+    },
     ("load_handles", "motion"): {"none"},
     ("select.mask", "mask"): {"nothing seen"},  # a selection may be empty
     ("select.within", "sources"): {"repeated"},

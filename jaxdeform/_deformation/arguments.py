@@ -54,7 +54,7 @@ def read_inputs(
     """Check the rigidity and the weights, and spread everything over all vertices."""
     rigidity = check_rigidity(rigidity, problem.n_vertices, problem.dtype)
     spread = spread_targets(problem, targets)
-    soft = _spread_weights(problem, handle_weights)
+    soft = read_weights(problem, handle_weights)
     # NumPy's arrays are JAX's once they are inside.
     return Inputs(cast(Array, spread), cast(Array, rigidity), soft)
 
@@ -97,7 +97,7 @@ def spread_targets(
     return jnp.broadcast_to(system.rest, shape).at[..., handles].set(targets)
 
 
-def _spread_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "vertices"]:
+def read_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "vertices"]:
     """Spread the weights of soft handles over all vertices, 0 at hard ones and elsewhere."""
     system, handles = problem.system, problem.handles
     if weights is None:

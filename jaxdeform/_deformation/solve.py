@@ -140,7 +140,7 @@ def deform(
                 "rest and edge_weights are differentiated by Implicit() only: give "
                 "adjoint=jd.Implicit()"
             )
-    out = _solve(problem.system, inputs, start, how)
+    out = _solve_at_once(problem.system, inputs, start, how)
     return out.result.error_if(out, ~out.ok) if throw else out
 
 
@@ -171,17 +171,20 @@ def energy(
     return jnp.sum(p * stiff) + jnp.sum(cells)
 
 
-@quick_jit(static=("how",), options=AS_FAST)
-def _solve(
+def solve(
     system: System,
     inputs: Inputs,
     start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
     how: Settings,
 ) -> Solution:
+    """Deform once; without a start, from Laplacian editing."""
     system = without_derivative(system)
     if start is None:
         start = system.rest + guess(system, inputs.targets - system.rest)
     return descend(system, inputs, jnp.asarray(start), how)[0]
+
+
+_solve_at_once = quick_jit(static=("how",), options=AS_FAST)(solve)
 
 
 def guess(system: System, displacement: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:

@@ -54,7 +54,8 @@ def lowest_mode(
         beta = run.state.beta
         error = beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
         sure = ~(2.0 * error >= jnp.abs(run.mu)) & (run.steps > 0)
-        return sure & ((run.steps >= _LEAST) | (beta == 0.0)) | (run.steps >= most)
+        # Without a way on, or with NaN, it is over before.
+        return sure & ((run.steps >= _LEAST) | ~(beta > 0.0)) | (run.steps >= most)
 
     at = jnp.zeros((), jnp.int32)
     nothing = _Run(at, begin, none, none, jnp.zeros_like(start), zero, none)

@@ -29,6 +29,13 @@ def test_fewer_unknowns_than_steps(n):
         assert np.sign(lowest(n, 64, shift)[0]) == np.sign(shift)
 
 
+def test_nan_ends():
+    nothing = lambda x: jnp.full_like(x, jnp.nan)  # noqa: E731
+    value, x = lowest_mode(nothing, lambda x: x, jnp.ones((3, 4)), 64)
+    assert not value < 0
+    assert not np.any(np.asarray(x))
+
+
 def lowest(n: int, steps: int, shift: float):
     """Return what some steps of Lanczos say of random matrices H and M, and the truth."""
     rng = np.random.default_rng(n)

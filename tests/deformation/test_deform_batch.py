@@ -1,0 +1,143 @@
+"""A batch in chunks, on several devices and processes: every member as if alone."""
+
+import importlib.util
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxdeform as jd
+
+CHILD = Path(__file__).with_name("batch_child.py")
+_spec = importlib.util.spec_from_file_location("batch_child", CHILD)
+batch_child = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(batch_child)
+# Chunks of two members of this plate.
+SMALL = 40 * 28 * 8 * 2 * 2
+
+
+@pytest.fixture(scope="module")
+def plate():
+    return batch_child.batch()
+
+
+@pytest.fixture(scope="module")
+def alone(plate) -> list[jd.Solution]:
+    problem, targets, rigidity = plate
+    return [jd.deform(problem, t, r) for t, r in zip(targets, rigidity, strict=True)]
+
+
+def test_members_are_as_if_alone(plate, alone):
+    """In chunks that do not divide the batch; told of and yielded in order."""
+    told = []
+    out = jd.deform_batch(*plate, memory=SMALL, progress=lambda *x: told.append(x))
+    assert told == [(2, 11), (4, 11), (6, 11), (8, 11), (10, 11), (11, 11)]
+    assert bool(out.ok.all())
+    for k, one in enumerate(alone):
+        np.testing.assert_allclose(out.vertices[k], one.vertices, atol=1e-10)
+        np.testing.assert_allclose(out.transforms[k], one.transforms, atol=1e-9)
+        np.testing.assert_allclose(out.energy[k, -1], one.energy[-1], rtol=1e-10, atol=1e-10)
+    seen = []
+    for members, part in jd.deform_in_chunks(*plate, memory=SMALL):
+        np.testing.assert_array_equal(part.vertices, out.vertices[members])
+        seen += range(members.start, members.stop)
+    assert seen == list(range(11))
+
+
+def test_what_is_the_same_for_all_is_given_once(plate, tmp_path):
+    problem, targets, rigidity = plate
+    field = np.full((1, problem.n_vertices), rigidity[3])
+    start = np.asarray(problem.mesh.vertices)
+    want = jd.deform_batch(
+        problem,
+        targets[:2],
+        np.repeat(field, 2, axis=0),
+        start=np.stack([start, start]),
+        memory=SMALL,
+    )
+    np.save(tmp_path / "targets.npy", targets[:2])
+    mapped = np.load(tmp_path / "targets.npy", mmap_mode="r")
+    for lam in (field, rigidity[3], rigidity[[3, 3]]):
+        got = jd.deform_batch(problem, mapped, lam, start=start, memory=SMALL)
+        np.testing.assert_array_equal(got.vertices, want.vertices)
+    one = jd.deform_batch(problem, targets[1], rigidity[[3]], start=start, memory=SMALL)
+    np.testing.assert_allclose(one.vertices[0], want.vertices[1], atol=1e-10)
+
+
+def test_a_bad_member_does_not_end_the_others(plate, alone):
+    problem, targets, rigidity = plate
+    targets, rigidity = targets.copy(), rigidity.copy()
+    targets[2, 0, 1], rigidity[5], rigidity[7] = np.inf, -1.0, np.nan
+    out = jd.deform_batch(problem, targets, rigidity, memory=SMALL)
+    bad = np.asarray(out.result == jd.Result.bad_input)
+    assert np.flatnonzero(bad).tolist() == [2, 5, 7]
+    for k in np.flatnonzero(~bad):
+        np.testing.assert_allclose(out.vertices[k], alone[k].vertices, atol=1e-10)
+    with pytest.raises(Exception, match="Not solved"):
+        jd.deform_batch(problem, targets, rigidity, memory=SMALL, throw=True)
+
+
+def test_what_does_not_fit_together_is_named(plate):
+    problem, targets, rigidity = plate
+    n = problem.n_vertices
+    for message, arguments in {
+        rf"rigidity are for {n} members, but targets for 11.*\(1, {n}\)": (targets, np.ones(n)),
+        "rigidity are for 11 members, but targets for 3": (targets[:3], rigidity),
+        r"targets have shape \(11, 7, 3\): give \(batch, 8, 3\)": (targets[:, :7], rigidity),
+        r"targets have shape \(0, 8, 3\).*at least one": (targets[:0], 1.0),
+    }.items():
+        for function in (jd.deform_batch, jd.deform_in_chunks):
+            with pytest.raises(jd.InputError, match=message):
+                function(problem, *arguments)
+    with pytest.raises(jd.InputError, match=r"rigidity: traced by JAX"):
+        jax.jit(lambda r: jd.deform_batch(problem, targets, r).vertices)(rigidity)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("before", [(), ("taskset", "-c", "0")], ids=["all CPUs", "one CPU"])
+def test_eight_devices(alone, tmp_path, before):
+    """More devices than CPUs: no hang, and the same shapes."""
+    if before and shutil.which("taskset") is None:
+        pytest.skip("needs taskset")
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=8"
+    subprocess.run(
+        [*before, sys.executable, CHILD, tmp_path / "8.npz"],
+        env=os.environ | {"XLA_FLAGS": flags},
+        check=True,
+        timeout=600,
+    )
+    check(tmp_path / "8.npz", alone, 8)
+
+
+@pytest.mark.slow
+def test_two_processes(alone, tmp_path):
+    """Both get the whole batch, of which each computed a half."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = str(free.getsockname()[1])
+    files = [tmp_path / f"{k}.npz" for k in range(2)]
+    ran = [
+        subprocess.Popen([sys.executable, CHILD, file, port, str(k)])
+        for k, file in enumerate(files)
+    ]
+    try:
+        assert [process.wait(timeout=600) for process in ran] == [0, 0]
+    finally:
+        for process in ran:
+            process.kill()
+    for file in files:
+        check(file, alone, 2)
+
+
+def check(file: Path, alone: list[jd.Solution], devices: int) -> None:
+    with np.load(file) as found:
+        assert found["devices"] == devices
+        for k, one in enumerate(alone):
+            np.testing.assert_allclose(found["vertices"][k], one.vertices, atol=1e-10)
+            np.testing.assert_allclose(found["energy"][k], one.energy[-1], rtol=1e-10, atol=1e-10)
