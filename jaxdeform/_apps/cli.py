@@ -1,4 +1,4 @@
-"""The command line: ``jaxdeform demo | inspect | deform | estimate``."""
+"""The command line: ``jaxdeform demo | inspect | deform | estimate | batch``."""
 
 import contextlib
 import errno
@@ -18,6 +18,7 @@ from rich.table import Table
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import make_folder
+from jaxdeform._apps.batch.command import batch
 from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.estimating import estimate
 from jaxdeform._apps.talk import console, mouth, patiently, since
@@ -158,3 +159,6 @@ app.command(cls=DeformCommand)(deform)
 
 
 app.command()(estimate)
+
+
+app.command()(batch)

@@ -1,0 +1,98 @@
+"""The command ``jaxdeform batch``."""
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import typer
+
+import jaxdeform as jd
+from jaxdeform._apps.arguments import make_folder
+from jaxdeform._apps.batch.manifest import read_manifest
+from jaxdeform._apps.talk import console, counted, patiently, since
+from jaxdeform._errors import printable
+
+MISSING = "jaxdeform batch needs further packages: pip install 'jaxdeform[batch]'"
+
+
+def batch(
+    manifest: Annotated[
+        Path | None, typer.Argument(help="CSV, JSON lines or Parquet file: one job a row.")
+    ] = None,
+    out: Annotated[
+        str | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder of the run (or an fsspec address); with --export, of meshes.",
+        ),
+    ] = None,
+    status: Annotated[
+        str | None, typer.Option(metavar="RUN", help="Say how far a run is, and do nothing.")
+    ] = None,
+    export: Annotated[
+        str | None, typer.Option(metavar="RUN", help="Write the results of a run as meshes.")
+    ] = None,
+    suffix: Annotated[str, typer.Option("--format", help="Their format.")] = "ply",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler; by default workers of our own."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes of our own. By default one for two CPUs."),
+    ] = None,
+    tries: Annotated[
+        int, typer.Option(min=2, help="Give a job up that has ended so many workers.")
+    ] = 3,
+    time_limit: Annotated[
+        float, typer.Option(min=1.0, help="The longest that a job may take, in seconds.")
+    ] = 3600.0,
+    csv: Annotated[bool, typer.Option("--csv", help="Write the summary as CSV too.")] = False,
+) -> None:
+    """Do many jobs: deformations and fits of many meshes. The same command goes on after a stop."""
+    try:
+        from jaxdeform._apps.batch import run, store, summary, worker
+    except ImportError as error:
+        raise jd.InputError(f"{MISSING} ({error})") from error
+
+    def existing(name: str):
+        root = store.find(name)
+        if root is None or not store.is_run(root) or not root.attrs.get("complete"):
+            raise jd.InputError(f"{name}: is no run: give the folder that -o named")
+        return root, store.jobs_of(root)
+
+    if status is not None:
+        root, jobs = existing(status)
+        done, failed, total = summary.count(root, jobs)
+        console.print(f"{done} of {total} jobs done, {failed} of them failed")
+        return
+    if out is None:
+        raise jd.InputError("give the folder of the run with -o")
+    if export is not None:
+        root, jobs = existing(export)
+        make_folder(Path(out))
+        written = summary.export(root, jobs, Path(out), f".{suffix.lstrip('.').lower()}")
+        console.print(f"wrote {written} meshes to {printable(out)}")
+        return
+    if manifest is None:
+        raise jd.InputError("give a manifest: a CSV, JSON lines or Parquet file")
+    began = time.perf_counter()
+    jobs = read_manifest(manifest)
+    root = patiently("planning", lambda: run.planned(out, jobs))
+    cache = bool(jax.config.values.get("jax_compilation_cache_dir"))  # cli.py has set it
+    settings = worker.Settings(out, run.new_session(), tries, time_limit, cache)
+    count = workers or max(1, (os.cpu_count() or 2) // 2)
+    counted(
+        "jobs",
+        len(jobs),
+        lambda tell: run.go_on(root, jobs, settings, scheduler, count, tell, console.print),
+    )
+    names = summary.write_table(out, summary.table(root, jobs), csv)
+    done, failed, total = summary.count(root, jobs)
+    console.print(f"{done} of {total} jobs done, {failed} of them failed, in {since(began)}")
+    console.print(f"wrote {printable(', '.join(names))}")
+    if failed:
+        raise typer.Exit(1)

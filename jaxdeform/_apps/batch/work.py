@@ -1,0 +1,110 @@
+"""One job: read, deform or fit. What it needs is named by the job, so any process can do it."""
+
+import time
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+import jaxdeform as jd
+from jaxdeform._apps.arguments import read_material, read_pose
+from jaxdeform._apps.batch.manifest import Job
+from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
+from jaxdeform._mesh.select import some_where
+from jaxdeform._result import name_of
+
+
+class Done(NamedTuple):
+    """What came of a job."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    """The last frame; of a fit, the poses are the input, and these are NaN."""
+    rigidity: Float[np.ndarray, "vertices"]
+    """What it was deformed with, or the estimate."""
+    energy: float
+    misfit: float
+    """Of a fit, in the unit of the mesh."""
+    steps: int
+    flipped: int
+    result: str
+    """The name of a member of `Result`."""
+    seconds: float
+
+
+def do(job: Job) -> Done:
+    """Do a job. **Raises** whatever is wrong with it."""
+    began = time.perf_counter()
+    mesh, moves, problem = _prepared(job.problem, job)
+    done = _fit(job, mesh, problem) if job.poses else _deform(job, mesh, moves, problem)
+    return done._replace(seconds=time.perf_counter() - began)
+
+
+@lru_cache(maxsize=4)
+def _mesh(path: str) -> jd.Mesh:
+    return jd.load_mesh(path)
+
+
+# The last problem, which the next job mostly shares.
+_kept: list = []
+
+
+def _prepared(key: tuple, job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
+    """Return the mesh, the moves of this job, and the problem, which the last job may have left."""
+    mesh = _mesh(job.mesh)
+    if job.handles:
+        moves = moves_of_file(mesh, Path(job.handles), None)
+        handles = moves.handles
+    elif job.poses:
+        chosen = [some_where(mesh, x, "fix or move") for x in (job.fix, job.move) if x]
+        moves, handles = None, np.unique(np.concatenate([x.vertices for x in chosen]))
+    else:
+        motion = Motion(job.rotate, job.about, job.translate)  # pyright: ignore[reportArgumentType]
+        moves = moves_by_place(mesh, [job.fix] if job.fix else [], job.move, motion)
+        handles = moves.handles
+    if not _kept or _kept[0] != key:
+        cells = jd.spokes(mesh) if job.method == "arap" else jd.rings(mesh, job.rings)
+        _kept[:] = key, jd.precompute(mesh, handles, cells=cells)
+    return mesh, moves, _kept[1]
+
+
+def _deform(job: Job, mesh: jd.Mesh, moves: Moves | None, problem: jd.Problem) -> Done:
+    assert moves is not None
+    own = job.method == "material"
+    local = jd.Newton() if own else jd.RotationFit()
+    rigidity = np.zeros(mesh.n_vertices)
+    if own:
+        rigidity = read_material(mesh, job.rigidity, list(job.stiff)).at(problem)
+    if job.frames is None:
+        out = jd.deform(problem, moves.targets, rigidity, local=local)
+    else:
+        path = jd.deform_path(problem, moves.path(job.frames), rigidity, local=local)
+        out = jax.tree.map(lambda x: x[-1], path)
+    return Done(
+        np.asarray(out.vertices),
+        rigidity,
+        float(out.energy[-1]),
+        np.nan,
+        int(out.steps),
+        int(out.flipped),
+        name_of(out.result),
+        0.0,
+    )
+
+
+def _fit(job: Job, mesh: jd.Mesh, problem: jd.Problem) -> Done:
+    rest = Path(job.mesh)
+    poses = np.stack([read_pose(Path(pose), mesh, rest) for pose in job.poses])
+    fit = jd.estimate_rigidity(problem, poses)
+    return Done(
+        np.full(mesh.vertices.shape, np.nan),
+        np.asarray(fit.field),
+        np.nan,
+        float(fit.misfit),
+        len(fit.history),
+        0,
+        name_of(fit.result),
+        0.0,
+    )
