@@ -68,5 +68,5 @@ def _look(
     metric = metric_of(system, energy.local, inputs.rigidity)
     gain = jnp.sum(at.gradient * apply_metric(system, metric, at.gradient))
     stationary = gain <= _STATIONARY * jnp.abs(at.energy) + at.rounding
-    value, _ = lowest_curvature(energy, system, inputs, metric, p, at.transforms, _MOST)
+    value, _ = lowest_curvature(energy, system, inputs, metric, p, at.transforms, most=_MOST)
     return stationary & (value >= 0.0)

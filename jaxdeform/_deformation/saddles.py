@@ -39,24 +39,25 @@ def lowest_curvature(
     metric: Metric | None,
     p: Float[Array, "3 vertices"],
     transforms: Float[Array, "3 3 vertices"],
+    wanted: Bool[Array, ""] | bool = True,
     most: int = MOST,
 ) -> tuple[Float[Array, ""], Float[Array, "3 vertices"]]:
     """Return the lowest curvature of the reduced energy, as far as its sign needs it, and where.
 
     It is relative to that of the metric, so it has no unit. The true one is no higher. The
-    direction is 0 where the curvature is not negative.
+    direction is 0 where the curvature is not negative. Unless ``wanted``, both are 0.
     """
 
     @custom_vmap
     def look(system, own):
-        inputs, metric, p, transforms = own
+        inputs, metric, p, transforms, wanted = own
         at = lambda x: energy.evaluate(system, inputs, x, transforms).gradient  # noqa: E731
         _, hessian = jax.linearize(at, p)
         precondition = partial(apply_metric, system, metric)
         # Any vector that is no symmetric one will do.
         index = jnp.arange(p.size, dtype=p.dtype).reshape(p.shape)
         start = jnp.where(system.free[None], jnp.sin(index * (1.0 + 0.37 * index)), 0.0)
-        return lowest_mode(hessian, precondition, start, most)
+        return lowest_mode(hessian, precondition, start, most, wanted)
 
     @look.def_vmap
     def look_at_some(size, is_batched, system, own):
@@ -64,7 +65,7 @@ def lowest_curvature(
         each = partial(look.fun, system)
         return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE)), (True, True)
 
-    return look(system, (inputs, metric, p, transforms))
+    return look(system, (inputs, metric, p, transforms, jnp.asarray(wanted)))
 
 
 class _Way(NamedTuple):
@@ -80,7 +81,7 @@ class _Way(NamedTuple):
 
 def leave_saddles(
     descend: Callable[[Float[Array, "3 vertices"]], Minimum],
-    curvature: Callable[[Array, Array], tuple[Array, Array]],
+    curvature: Callable[[Array, Array, Array], tuple[Array, Array]],
     start: Float[Array, "3 vertices"],
     size: Float[Array, ""],
     settings: Settings,
@@ -98,7 +99,7 @@ def leave_saddles(
         old, new = way.best.energy[way.best.steps], end.energy[end.steps]
         margin = settings.tolerance * jnp.abs(old)
         lower, higher = first | (new < old - margin), ~first & ~(new <= old + margin)
-        value, along = curvature(end.p, end.transforms)
+        value, along = curvature(end.p, end.transforms, end.converged)
         longest = jnp.sqrt(jnp.max(jnp.sum(along**2, axis=0)))
         along = along * (_AWAY * size / jnp.where(longest > 0, longest, 1.0))
         both = jax.tree.map(partial(jnp.where, first), end, _joined(way.best, end))

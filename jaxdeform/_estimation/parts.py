@@ -259,7 +259,8 @@ class _Search:
         """Search on from an evaluation, under its weights."""
         evaluate = lambda theta: self._evaluate(theta, first.noise)  # noqa: E731
         left = self.limit - len(self.history)
-        return search(evaluate, first, box_solver(*self.model.bounds), left)
+        solver = box_solver(*self.model.bounds, self.model.poses.count)
+        return search(evaluate, first, solver, left)
 
     def _without_outliers(self, best: Fit, result: Result):
         floor = _MISPLACED * self.model.problem.mesh.diagonal

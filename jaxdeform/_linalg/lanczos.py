@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._linalg.conjugate_gradients import Vectors, dot
 
@@ -16,6 +16,7 @@ def lowest_mode(
     precondition: Callable[[Vectors], Vectors],
     start: Vectors,
     most: int,
+    wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[Float[Array, ""], Vectors]:
     """Return the lowest ``mu`` with ``H x = mu M x``, as far as its sign needs it, and x.
 
@@ -23,6 +24,9 @@ def lowest_mode(
     ``x^T H x`` with ``x^T M x = 1``: never below the true one, so that a negative value proves that
     H has negative curvature. x is 0 where the value is not negative. It stops once the value is
     twice as large as its error bound, or after ``most`` steps.
+
+    Unless ``wanted``, nothing is done, and the value is 0. (A condition around the call would make
+    a batch of all that it reads.)
 
     The tridiagonal matrix is looked at after 4, 8, 12, 18, 27, 40 and 60 steps.
 
@@ -74,8 +78,8 @@ def lowest_mode(
         ended = lambda run: jnp.where(turn == 0, known(run), run.steps >= old.steps)  # noqa: E731
         return turn + 1, jax.lax.while_loop(lambda run: ~ended(run), look, nothing)
 
-    wanted = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
-    turn, run = jax.lax.while_loop(wanted, again, (at, nothing))
+    more = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
+    turn, run = jax.lax.while_loop(lambda x: wanted & more(x), again, (at, nothing))
     return run.mu, jnp.where(turn == 2, run.x, 0.0)
 
 
