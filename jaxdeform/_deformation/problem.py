@@ -22,6 +22,8 @@ from jaxdeform._mesh.bounded import bounded_cells
 from jaxdeform._mesh.cells import Cells, principal_moments, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.normals import corner_sides
+from jaxdeform._mesh.polygons import from_triangles
 
 # Further from the origin, in diagonals, float32 keeps fewer than four digits of a position.
 _FAR_IN_FLOAT32 = 1e3
@@ -45,6 +47,8 @@ class System(eqx.Module):
     factor: Factor
     initial_guess: LaplacianGuess
     faces: Int[Array, "faces 3"]
+    sides: Float[Array, "faces 3"] | None
+    """-1 where a face is turned over as seen from a corner; None stands for 1 everywhere."""
 
     def held(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
         """Return x at the vertices that are not free, 0 elsewhere.
@@ -153,6 +157,7 @@ def precompute(
         )
     used, matrix, factor = _factorise(cells, rest, split, dtype)
     moments, axes = principal_moments(used)
+    sides = corner_sides(from_triangles(mesh.faces))
     put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
     system = System(
         rest=put(rest.T),
@@ -166,6 +171,7 @@ def precompute(
         factor=factor,
         initial_guess=laplacian_guess(used, split.free & (split.soft == 0), dtype),
         faces=jax.device_put(mesh.faces.astype(np.int32)),
+        sides=None if sides is None else put(sides.reshape(-1, 3)),
     )
     return Problem(system, split.index, used)
 

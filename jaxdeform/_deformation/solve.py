@@ -99,7 +99,8 @@ def deform(
     - handle_weights: other weights of the soft handles than in `precompute`, one or
       (handles,), from 0 to those of `precompute` (whose factor stays, and bounds the energy
       from above). Entries of hard handles are not read. Differentiable.
-    - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods.
+    - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods. Faces need not agree
+      about the side, and on a Moebius band they cannot: around each vertex one side is chosen.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
       (the only one of QuasiNewton).
     - rest: (vertices, 3), the problem's own rest positions, given to be differentiated in: the

@@ -177,7 +177,11 @@ def _inspect_structure(points, faces, counts, report) -> None:
     ascending = np.where(directed[:, 0] < directed[:, 1], 1, -1)
     twist = np.bincount(inverse.ravel(), ascending)
     clash = int(((times == 2) & (twist != 0)).sum())
-    report(clash, "edges have faces of opposite orientation", "harmless without normals=True")
+    report(
+        clash,
+        "edges have faces of opposite orientation",
+        "harmless: around each vertex one side is chosen",
+    )
     center = points[used].mean(axis=0)
     a, b, c = (points[faces[:, k]] - center for k in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._errors import InputError
+from jaxdeform._mesh.normals import corner_sides, corner_vectors, summed
 from jaxdeform._mesh.parsed import Parsed
-from jaxdeform._mesh.polygons import Polygons, area_vectors, from_lists, summed, unit
+from jaxdeform._mesh.polygons import Polygons, from_lists, unit
 from jaxdeform._mesh.words import (
     content,
     damaged,
@@ -206,8 +207,13 @@ def _new_normals(
     named = np.where(named < count, named, -1)
     has = np.flatnonzero(named >= 0)
     vertex = polygons.corners[has]
-    vectors = np.repeat(area_vectors(points, polygons), polygons.sizes, axis=0)[has]
-    _, group = np.unique(alike[named[has]] * len(points) + vertex, return_inverse=True)
+    vectors = corner_vectors(points, polygons)[has]
+    key = alike[named[has]] * len(points) + vertex
+    _, first, group = np.unique(key, return_index=True, return_inverse=True)
+    sides = corner_sides(polygons)
+    if sides is not None:
+        side = sides[has]
+        vectors *= (side * side[first[group]])[:, None]  # the first face's, in each group
     sums = summed(vectors, group, int(group.max(initial=-1)) + 1)
     code = named[has] * len(points) + vertex
     pairs, one, inverse = np.unique(code, return_index=True, return_inverse=True)

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxdeform._errors import InputError
+from jaxdeform._mesh.normals import vertex_normals
 from jaxdeform._mesh.parsed import Parsed
-from jaxdeform._mesh.polygons import Polygons, from_lists, vertex_normals
+from jaxdeform._mesh.polygons import Polygons, from_lists
 from jaxdeform._mesh.words import (
     content,
     damaged,

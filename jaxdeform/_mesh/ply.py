@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxdeform._mesh.normals import vertex_normals
 from jaxdeform._mesh.parsed import Parsed
 from jaxdeform._mesh.ply_body import Field, binary_fields, text_place, text_rows
 from jaxdeform._mesh.ply_header import (
@@ -21,7 +22,6 @@ from jaxdeform._mesh.polygons import (
     from_lists,
     from_triangles,
     unit,
-    vertex_normals,
 )
 from jaxdeform._mesh.words import damaged, excerpt, joined, polygon, real, with_words
 
