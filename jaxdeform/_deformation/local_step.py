@@ -145,6 +145,10 @@ class Newton(_Material):
         rotation = polar_rotation_of_grid(as_grid(c))
         m = product(as_grid(c), rotation)
         m = [[m[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]  # C R = U S U^T
+        # Squares of these numbers leave the range of float32 for meshes 1e10 long.
+        size = _size(b, rigidity)
+        m = [[v / size for v in row] for row in m]
+        b, rigidity = b / size[None], rigidity / size
         data = m, list(b), rigidity, gradient_tolerance(m, rigidity)
         x, unsolved = block_newton(*data)
         few = max(64, unsolved.shape[0] // 64)
@@ -314,9 +318,13 @@ class AffineFit:
 
 def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:
     """Divide each cell's problem by its size, so that one tolerance fits all."""
-    size = rigidity + jnp.max(jnp.abs(b), axis=0)
-    size = jnp.where(size > 0, size, 1.0)
+    size = _size(b, rigidity)
     return c / size[None, None], b / size[None], rigidity / size
+
+
+def _size(b: Vectors, rigidity: Scalars) -> Scalars:
+    size = rigidity + jnp.max(jnp.abs(b), axis=0)
+    return jnp.where(size > 0, size, 1.0)
 
 
 def _energy_rounding(c, b, lam):

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from jaxdeform._checks import check_tolerance, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.poses import read_poses
-from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.mesh import LARGEST, Mesh
 
 # Rounds of growing and fitting again. Real meshes need 3 to 8.
 _GROWTHS = 50
@@ -117,10 +117,12 @@ def find_handle_groups(
 
 def _check_deformed(deformed: ArrayLike, n: int) -> Float[np.ndarray, "poses vertices 3"]:
     poses = read_poses("deformed", deformed, n, np.dtype(np.float64))
-    bad = np.argwhere(~np.isfinite(poses).all(axis=2))
+    bad = np.argwhere(~(np.abs(poses) <= LARGEST).all(axis=2))
     if len(bad):
+        pose, vertex = bad[0]
         raise InputError(
-            f"deformed: vertex {bad[0][1]} of pose {bad[0][0]} is not finite: give real positions"
+            f"deformed: vertex {vertex} of pose {pose} is {poses[pose, vertex].tolist()}: give "
+            f"finite positions, up to {LARGEST:g}"
         )
     return poses
 

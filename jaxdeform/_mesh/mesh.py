@@ -20,6 +20,10 @@ _FLAT = 1e-13
 
 NO_AREA = "has no area"
 
+# Energies are squares of lengths, to be known to 16 digits: beyond this length, and below its
+# inverse, they leave the range of float64.
+LARGEST = 1e140
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
@@ -43,8 +47,8 @@ class Mesh:
 
     **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (see
     ``deform(rest=)`` for derivatives to the rest shape); a vertex is not finite; a face index is
-    out of range; a face repeats a vertex, or none has an area (`repair`); the source has
-    other faces.
+    out of range; a face repeats a vertex, or none has an area (`repair`); lengths above 1e140 or
+    below 1e-140; the source has other faces.
 
     Example:
         >>> import jaxdeform as jd
@@ -170,7 +174,25 @@ def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, n
             f"face {bad[0]} {corners[bad[0]].tolist()} names a vertex out of range: vertices "
             f"are 0 to {len(points) - 1}"
         )
+    _check_scale(points, corners)
     return points, corners
+
+
+def _check_scale(points: np.ndarray, corners: np.ndarray) -> None:
+    """Raise InputError where squares of lengths would leave the range of float64."""
+    far = np.abs(points).max(axis=1)
+    if far.max() > LARGEST:
+        k = int(far.argmax())
+        raise InputError(
+            f"vertex {k} is {points[k].tolist()}: squares of lengths above {LARGEST:g} leave the "
+            "range of float64; give the vertices in a larger unit of length"
+        )
+    size = np.ptp(points[corners.ravel()], axis=0).max()
+    if 0 < size < 1 / LARGEST:
+        raise InputError(
+            f"the mesh is {size:.3g} long: squares of lengths below {1 / LARGEST:g} leave the "
+            "range of float64; give the vertices in a smaller unit of length"
+        )
 
 
 def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, int]]:
