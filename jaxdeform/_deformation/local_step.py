@@ -135,10 +135,13 @@ class Newton(_Material):
     First quasi-Newton steps with the block diagonal of the Hessian, which in principal axes is
     nearly all of it (three scalars and three 2x2 blocks). Then, on the few cells that this does not
     solve, exact 9x9 steps.
+
+    **Fields**
+
+    - max_steps: bound on the exact steps of a cell; two are usual.
     """
 
     max_steps: int = 60
-    """Bound on the exact steps of a cell; two are usual."""
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
         """Return the minimisers T (3, 3, n)."""
@@ -167,10 +170,14 @@ class LBFGS(_Material):
     3,000 ran off to 1e100 and became NaN. So here the line search allows for rounding, steps
     without positive curvature are not remembered, and a step whose line search fails is refused.
     The cell goes on without memory; if that fails too, it is done.
+
+    **Fields**
+
+    - tolerance: stop at this gradient norm, relative to the cell's size (no less than 16 eps).
+    - max_steps: bound on the steps of a cell.
     """
 
     tolerance: float = 1e-10
-    """Stop at this gradient norm, relative to the cell's size (no less than 16 eps)."""
     max_steps: int = 200
 
     def __post_init__(self) -> None:
@@ -232,6 +239,10 @@ class GradientDescent(_Material):
 
     The step is one over a bound on the curvature along the way. The bound holds up to stretches of
     4; a step that raises the energy is refused and halved.
+
+    **Fields**
+
+    - max_steps: number of steps of each cell.
     """
 
     max_steps: int = 500

@@ -67,14 +67,17 @@ class Problem(eqx.Module):
     A problem is a value: a pytree of arrays that can be copied, pickled, written to a file with
     ``equinox.tree_serialise_leaves``, returned from a jitted function or sent to another process.
     A factor that is not there yet is made there, from the matrix that the problem holds.
+
+    **Fields**
+
+    - system: the arrays that the iterations read.
+    - handles: (handles,) indices of the handle vertices, in the order of the targets' rows.
+    - cells: the cells (`rings` with r = 1 by default), with the weights that are computed with.
     """
 
     system: System
-    """The arrays that the iterations read."""
     handles: Int[np.ndarray | Array, "handles"]
-    """Indices of the handle vertices, in the order of the targets' rows."""
     cells: Cells = eqx.field(static=True)
-    """The cells (`rings` with r = 1 by default), with the weights that are computed with."""
 
     @property
     def mesh(self) -> Mesh:

@@ -24,20 +24,26 @@ from jaxdeform._result import Result, succeeded
 
 
 class Solution(eqx.Module):
-    """A deformed mesh and how it was reached."""
+    """A deformed mesh and how it was reached.
+
+    **Fields**
+
+    - vertices: (*batch, vertices, 3) deformed positions p'.
+    - transforms: (*batch, vertices, 3, 3) T_k of every cell at these positions.
+    - energy: (*batch, history) reduced energy at the start and after each step; the last value
+      repeats once it stopped.
+    - steps: (*batch,) iterations done.
+    - result: what happened, a member of `Result`.
+    - flipped: (*batch,) number of cells that are inside out (det T <= 0): a part of the mesh is its
+      mirror image.
+    """
 
     vertices: Float[Array, "*batch vertices 3"]
-    """Deformed positions p'."""
     transforms: Float[Array, "*batch vertices 3 3"]
-    """T_k of every cell at these positions."""
     energy: Float[Array, "*batch history"]
-    """Reduced energy at the start and after each step; the last value repeats once it stopped."""
     steps: Int[Array, "*batch"]
-    """Iterations done."""
     result: Result
-    """What happened: a member of `Result`."""
     flipped: Int[Array, "*batch"]
-    """Number of cells that are inside out (det T <= 0): a part of the mesh is its mirror image."""
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:

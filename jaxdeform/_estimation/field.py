@@ -61,6 +61,8 @@ _NORMAL_95 = 1.959964
 class FieldEstimate:
     """A rigidity per vertex, as `estimate_rigidity_field` finds it.
 
+    **Fields**
+
     - field: (vertices,) the rigidity of each vertex; its unit is length squared.
     - interval: (vertices, 2) 95 % interval of each, under the prior.
     - determined: (vertices,) True where the interval is within a factor of ten to both sides. Where

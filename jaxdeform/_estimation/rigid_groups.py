@@ -16,13 +16,20 @@ _GROWTHS = 50
 
 
 class RigidGroup(NamedTuple):
-    """Vertices that moved together: ``p' = R p + t`` in every pose."""
+    """Vertices that moved together: ``p' = R p + t`` in every pose.
+
+    **Fields**
+
+    - vertices: (members,) indices, ascending.
+    - rotations: (poses, 3, 3) R.
+    - translations: (poses, 3) t.
+    - error: largest distance of a vertex from where that motion puts it.
+    """
 
     vertices: Int[np.ndarray, "members"]
     rotations: Float[np.ndarray, "poses 3 3"]
     translations: Float[np.ndarray, "poses 3"]
     error: float
-    """Largest distance of a vertex from where that motion puts it."""
 
     @property
     def degrees(self) -> Float[np.ndarray, "poses"]:

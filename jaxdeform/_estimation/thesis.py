@@ -17,13 +17,19 @@ from jaxdeform._result import Result
 
 
 class ThesisEstimate(NamedTuple):
-    """What `estimate_rigidity_thesis` returns."""
+    """What `estimate_rigidity_thesis` returns.
+
+    **Fields**
+
+    - rigidity: the last value; its unit is length squared.
+    - path: (evaluations,) rigidity at each evaluation.
+    - history: (evaluations,) Frobenius norm of the difference at each.
+    - result: how the search ended, a member of `Result`.
+    """
 
     rigidity: float
     path: Float[np.ndarray, "evaluations"]
-    """Rigidity at each evaluation."""
     history: Float[np.ndarray, "evaluations"]
-    """Frobenius norm of the difference at each."""
     result: Result
 
 

@@ -65,6 +65,7 @@ def _distances(mesh: Mesh, faces, sources) -> Float[np.ndarray, "vertices"]:
         # 0, and one of 1e-100 did not end.
         size = mesh.diagonal
         unit = (mesh.vertices - mesh.center) / size
-        out[reached] = size * igl.exact_geodesic(unit, faces, on, none, reached, none)
+        out[reached] = igl.exact_geodesic(unit, faces, on, none, reached, none)
+        out[reached] *= size
     out[sources] = 0.0
     return out

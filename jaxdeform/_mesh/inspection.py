@@ -70,12 +70,16 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What `inspect` found; ``str()`` turns it into a report."""
+    """What `inspect` found; ``str()`` turns it into a report.
+
+    **Fields**
+
+    - counts: sizes and measures by name: lengths in the unit of the mesh, angles in degrees.
+    - findings: what is wrong or unusual, one sentence each, and what jaxdeform does about it.
+    """
 
     counts: dict[str, int | float]
-    """Sizes and measures by name: lengths in the unit of the mesh, angles in degrees."""
     findings: tuple[str, ...]
-    """What is wrong or unusual, one sentence each, and what jaxdeform does about it."""
 
     def __str__(self) -> str:
         """Return the report."""

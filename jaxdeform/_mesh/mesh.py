@@ -45,6 +45,15 @@ class Mesh:
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
     - source: what `load_mesh` remembers of a file with these faces, for `save_mesh`.
 
+    **Fields**
+
+    - vertices, faces: as given, but read-only.
+    - solid_faces: (solid, 3) the faces that have an area. Only these have edges, and so a part in
+      the energy.
+    - source: the file that the mesh was read from, so that it can be written with other positions.
+      It is pickled with the mesh, but meshes with the same numbers are equal whatever file they are
+      from: it changes no result.
+
     **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (see
     ``deform(rest=)`` for derivatives to the rest shape); a vertex is not finite; a face index is
     out of range; a face repeats a vertex, or none has an area (`repair`); lengths above 1e140 or
@@ -57,15 +66,9 @@ class Mesh:
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
-    """Positions, in any unit of length."""
     faces: Int[np.ndarray, "faces 3"]
-    """Vertex indices, counter-clockwise seen from outside."""
     solid_faces: Int[np.ndarray, "solid 3"]
-    """The faces that have an area. Only these have edges, and so a part in the energy."""
     source: Source | None
-    """The file that the mesh was read from, so that it can be written with other positions. It is
-    pickled with the mesh, but meshes with the same numbers are equal whatever file they are from:
-    it changes no result."""
 
     def __init__(
         self, vertices: ArrayLike, faces: ArrayLike, *, source: Source | None = None
