@@ -13,6 +13,7 @@ from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.deformed import residual_of
 from jaxdeform._estimation.poses import check_poses
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._result import Result
 
 
@@ -76,7 +77,7 @@ def estimate_rigidity_thesis(
     choose_adjoint(solver, None)
     rigidity, path, history = float(start), [], []
     for _ in range(max_evaluations):
-        vertices = deform(problem, poses.targets[0], rigidity, solver=solver).vertices
+        vertices = settled(deform(problem, poses.targets[0], rigidity, solver=solver).vertices)
         path.append(rigidity)
         history.append(float(np.linalg.norm(residual_of(poses, vertices[None]))))
         if not np.isfinite(history[-1]):
