@@ -151,12 +151,3 @@ def _cast(array: np.ndarray, dtype: np.dtype) -> np.ndarray:
         return array
     with np.errstate(over="ignore", invalid="ignore"):  # overflow gives infinity, refused later
         return array.astype(dtype, copy=False)
-
-
-def distinct(values: Int[np.ndarray, "values"]) -> Int[np.ndarray, "distinct"]:
-    """Return the distinct values in ascending order, as np.unique does.
-
-    np.unique of NumPy 2.4 hashes them: 3.9 s for three million, and 0.2 s by sorting.
-    """
-    ascending = np.sort(values)
-    return ascending[np.diff(ascending, prepend=ascending[:1] - 1) != 0]

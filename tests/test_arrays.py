@@ -8,7 +8,6 @@ from good_calls import SKIN, good_calls, kind_of
 from helpers import EXACT
 
 import jaxdeform as jd
-from jaxdeform._arrays import distinct
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +78,3 @@ def test_what_numpy_works_out_cannot_be_traced(calls, function, argument):
     for traced in (given, list(given)):
         with pytest.raises(jd.InputError, match=rf"{argument}: traced by JAX .*known numbers"):
             jax.jit(lambda x: call(**arguments | {argument: x}))(traced)
-
-
-def test_distinct_is_what_numpy_finds():
-    for size in (0, 1, 5, 1000):
-        values = np.random.default_rng(size).integers(-300, 300, size)
-        np.testing.assert_array_equal(distinct(values), np.unique(values))

@@ -34,6 +34,8 @@ class PoseDerivatives(NamedTuple):
     """0 at vertices that do not count."""
     solver_error: Float[np.ndarray, "poses vertices 3"]
     """From the minimum to where the solver stopped; 0 at vertices that do not count."""
+    ends: list[State]
+    """Where the solver stopped in each pose."""
 
 
 def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoint) -> list[State]:
@@ -79,6 +81,7 @@ def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDeri
         np.where(counted[..., None], jacobian, 0.0),
         residual_of(poses, vertices),
         np.where(counted, error, 0.0),
+        ends,
     )
 
 

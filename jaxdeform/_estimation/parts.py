@@ -234,6 +234,7 @@ class _Search:
                 model.problem,
                 poses,
                 model.field(best.theta),
+                best.ends,
                 model.solver,
                 model.adjoint,
                 self.target_noise,

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from jaxdeform._checks import check_tolerance, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.poses import read_poses
+from jaxdeform._mesh.grouping import summed
 from jaxdeform._mesh.mesh import LARGEST, Mesh
 
 # Rounds of growing and fitting again. Real meshes need 3 to 8.
@@ -172,18 +173,14 @@ def _ring_errors(p, poses, graph: sp.csr_matrix) -> Float[np.ndarray, "vertices"
     error = np.zeros(n)
     for q in poses:
         moved = q[column] - q[row]
-        mean = [_sums(row, x, n) / count[:, None] for x in (edge, moved)]
+        mean = [summed(x, row, n) / count[:, None] for x in (edge, moved)]
         a, b = edge - mean[0][row], moved - mean[1][row]
         rotation = _rotations(
-            _sums(row, (b[:, :, None] * a[:, None, :]).reshape(-1, 9), n).reshape(n, 3, 3)
+            summed((b[:, :, None] * a[:, None, :]).reshape(-1, 9), row, n).reshape(n, 3, 3)
         )
         off = np.linalg.norm(np.einsum("eij,ej->ei", rotation[row], a) - b, axis=1)
         np.maximum.at(error, row, off)
     return np.where(count > 2, error, np.inf)
-
-
-def _sums(row, values, n: int) -> np.ndarray:
-    return np.stack([np.bincount(row, column, n) for column in values.T], axis=1)
 
 
 def _grow(p, poses, graph, seed: int | np.integer, reach: float, allowed) -> RigidGroup | None:

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from jaxdeform._arrays import distinct
+from jaxdeform._mesh.grouping import distinct
 
 
 class Tree(NamedTuple):

@@ -8,9 +8,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from jaxdeform._arrays import distinct, read_host_array, read_integers
+from jaxdeform._arrays import read_host_array, read_integers
 from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.grouping import distinct
 from jaxdeform._mesh.parsed import Source
 
 # A triangle has no area if its height is below this fraction of its longest edge: float64 cannot

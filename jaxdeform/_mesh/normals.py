@@ -8,7 +8,7 @@ one vertex there is always a choice.
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxdeform._arrays import distinct
+from jaxdeform._mesh.grouping import distinct, summed
 from jaxdeform._mesh.mesh import connected_components
 from jaxdeform._mesh.polygons import Polygons, area_vectors, unit
 
@@ -64,10 +64,3 @@ def corner_vectors(
 ) -> Float[np.ndarray, "corners 3"]:
     """Return the area vector of the polygon of each corner."""
     return np.repeat(area_vectors(points, polygons), polygons.sizes, axis=0)
-
-
-def summed(
-    vectors: Float[np.ndarray, "rows 3"], where: Int[np.ndarray, "rows"], count: int
-) -> Float[np.ndarray, "count 3"]:
-    """Return the sums of the rows that belong together."""
-    return np.stack([np.bincount(where, axis, count) for axis in vectors.T], axis=1)

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._errors import InputError
-from jaxdeform._mesh.normals import corner_sides, corner_vectors, summed
+from jaxdeform._mesh.grouping import summed
+from jaxdeform._mesh.normals import corner_sides, corner_vectors
 from jaxdeform._mesh.parsed import Extras, Parsed
 from jaxdeform._mesh.polygons import Polygons, from_lists, unit
 from jaxdeform._mesh.words import (
