@@ -20,7 +20,9 @@ def settled(tree: Tree) -> Tree:
     """
     began = time.perf_counter()
     for leaf in jax.tree.leaves(tree):
-        while isinstance(leaf, jax.Array) and not leaf.is_ready():
+        # Every array that is no tracer has is_ready; the abstract class does not name it.
+        ready = getattr(leaf, "is_ready", lambda: True)
+        while not ready():
             waited = time.perf_counter() - began
             time.sleep(min(max(0.1 * waited, _SHORTEST), _LONGEST))
     return tree
