@@ -54,6 +54,12 @@ def ends(mesh: jd.Mesh, fraction: float = 0.04, along: int = 1) -> np.ndarray:
     return np.flatnonzero((height < fraction) | (height > 1 - fraction))
 
 
+def lower_and_upper(bar: jd.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices at the two ends of the bar."""
+    y = bar.vertices[:, 1]
+    return np.flatnonzero(y < 6), np.flatnonzero(y > 145)
+
+
 def tetrahedron(offset=0.0):
     """Return the arrays of a tetrahedron."""
     v = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) + offset
@@ -111,3 +117,22 @@ def noisy(mesh: jd.Mesh, pose: np.ndarray, seed: int) -> np.ndarray:
     """Return the pose with independent noise at every coordinate."""
     draw = np.random.default_rng(seed).standard_normal(pose.shape)
     return pose + NOISE * mesh.diagonal * draw
+
+
+def moved(mesh):
+    """Return positions of which none is what it was, and no face keeps its plane."""
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    return mesh.vertices @ turn * 1.3 + 0.1 * np.sin(7 * mesh.vertices) + 0.7
+
+
+def crosses(points, *faces):
+    """Return the mean normals of polygons, by loops."""
+    out = []
+    for face in faces:
+        total = np.zeros(3)
+        for k, here in enumerate(face):
+            total += np.cross(
+                points[here] - points[0], points[face[(k + 1) % len(face)]] - points[0]
+            )
+        out.append(total)
+    return out

@@ -2,9 +2,11 @@
 
 import ast
 import doctest
+import functools
 import graphlib
 import importlib
 import inspect
+import pydoc
 import re
 import shlex
 from pathlib import Path
@@ -83,6 +85,20 @@ def test_every_public_name_is_explained(name):
         for member, value in vars(thing).items():
             if inspect.isfunction(value) and not member.startswith("_"):
                 assert inspect.getdoc(value), f"{name}.{member} has no docstring"
+
+
+@pytest.mark.parametrize("name", [name for name in sorted(PUBLIC) if inspect.isclass(PUBLIC[name])])
+def test_help_tells_of_every_field(name):
+    """A string below a field is in the source alone; a list in the docstring is in help() too."""
+    thing = PUBLIC[name]
+    said = pydoc.plain(pydoc.render_doc(thing))
+    listed = re.findall(r"^ \|  - (\w[\w, ]*): \S", said, re.MULTILINE)
+    told = {field for fields in listed for field in fields.split(", ")}
+    fields = {field for each in thing.__mro__ for field in vars(each).get("__annotations__", {})}
+    assert {field for field in fields if not field.startswith("_")} <= told
+    for member, value in vars(thing).items():
+        if isinstance(value, property | functools.cached_property) and member[0] != "_":
+            assert inspect.getdoc(value), f"{name}.{member} has no docstring"
 
 
 def test_only_public_jax_is_used():

@@ -22,20 +22,26 @@ class LaplacianEditor(eqx.Module):
     Without similarities, the columns of the matrix are the vertices, and the rows of ``pull`` are
     three right-hand sides. With similarities, the columns are all coordinates, and there is one
     right-hand side.
+
+    **Fields**
+
+    - rest: (vertices, 3) rest positions.
+    - handles: (handles,) indices of the handle vertices, in the order of the targets' rows.
+    - free: (columns,) True for each unknown.
+    - soft: (columns,) the weight of each soft handle; 0 elsewhere.
+    - pull: (rows, columns) L^T delta, the right-hand side of the details; zero where the matrix
+      rotates the details.
+    - normal: the matrix of the normal equations.
+    - factor: the factor of its free-free block.
     """
 
     rest: Float[Array, "vertices 3"]
     handles: Int[np.ndarray | Array, "handles"]
     free: Bool[Array, "columns"]
-    """True for each unknown."""
     soft: Float[Array, "columns"]
-    """The weight of each soft handle; 0 elsewhere."""
     pull: Float[Array, "rows columns"]
-    """L^T delta, the right-hand side of the details; zero where the matrix rotates the details."""
     normal: EllMatrix
-    """The matrix of the normal equations."""
     factor: Factor
-    """The factor of its free-free block."""
 
     def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
         """Return the edited positions, differentiable in the targets (handles, 3)."""

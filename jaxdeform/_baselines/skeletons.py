@@ -14,12 +14,16 @@ from jaxdeform._mesh.words import real, whole
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Joints and the bones between them; made by `load_skeleton`."""
+    """Joints and the bones between them; made by `load_skeleton`.
+
+    **Fields**
+
+    - joints: (joints, 3) positions, in the unit of the file.
+    - bones: (bones, 2) the two joints of each bone.
+    """
 
     joints: Float[np.ndarray, "joints 3"]
-    """Positions, in the unit of the file."""
     bones: Int[np.ndarray, "bones 2"]
-    """The two joints of each bone."""
 
     @property
     def segments(self) -> Float[np.ndarray, "bones 2 3"]:

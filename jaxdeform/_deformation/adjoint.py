@@ -23,6 +23,10 @@ class Unrolled:
 
     Exact for the number of steps taken, converged or not. Memory grows by one mesh a step.
 
+    **Fields**
+
+    - needs_one_energy: see `Adjoint`.
+
     Example:
         >>> import jaxdeform as jd
         >>> jd.Unrolled()
@@ -67,6 +71,13 @@ class Implicit:
     Where the linear system is not solved, the derivative is NaN, not a wrong number: the state is
     at a saddle or far from converged, or ``max_steps`` is too low.
 
+    **Fields**
+
+    - tolerance: relative residual of the linear system (but no less than the precision allows).
+    - max_steps: most steps of conjugate gradients.
+    - throw: raise an error, also inside jit, instead of returning NaN.
+    - needs_one_energy: see `Adjoint`.
+
     Example:
         >>> import jaxdeform as jd
         >>> jd.Implicit(tolerance=1e-6).max_steps
@@ -74,11 +85,8 @@ class Implicit:
     """
 
     tolerance: float = 1e-10
-    """Relative residual of the linear system (but no less than the precision allows)."""
     max_steps: int = 500
-    """Most steps of conjugate gradients."""
     throw: bool = False
-    """Raise an error, also inside jit, instead of returning NaN."""
 
     needs_one_energy: ClassVar[bool] = True
 

@@ -23,6 +23,13 @@ class Alternating:
     Each step lowers the energy (except with the normal term). Reaching the number is the normal
     end.
 
+    **Fields**
+
+    - steps: number of iterations, or the most of them where a tolerance is given.
+    - tolerance: stop early once a step is expected to lower the energy by less than this fraction
+      of it.
+    - can_unroll, needs_one_energy: see `Solver`.
+
     Example:
         >>> import jaxdeform as jd
         >>> jd.Alternating(steps=50).steps
@@ -30,9 +37,7 @@ class Alternating:
     """
 
     steps: int = 100
-    """Number of iterations, or the most of them where a tolerance is given."""
     tolerance: float | None = None
-    """Stop early once a step is expected to lower the energy by less than this fraction of it."""
 
     can_unroll: ClassVar[bool] = True
     needs_one_energy: ClassVar[bool] = False

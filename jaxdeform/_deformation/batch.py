@@ -20,6 +20,7 @@ from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import Solution, solve
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.lbfgs import SLOTS
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 
 # Arrays of a member, in numbers per vertex: targets, start, rigidity, positions, transforms, and
@@ -292,4 +293,4 @@ def _finished(chunk: tuple[int, Solution], size: int) -> tuple[slice, Solution]:
         out = jax.tree.map(partial(multihost_utils.process_allgather, tiled=True), out)
     last = min(first + len(out.steps), size)
     out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), out)
-    return slice(first, last), jax.block_until_ready(out)
+    return slice(first, last), jax.block_until_ready(settled(out))

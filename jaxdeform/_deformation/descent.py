@@ -33,10 +33,15 @@ class Anchor(NamedTuple):
 
 @runtime_checkable
 class Adjoint(Protocol):
-    """How derivatives are made: what ``deform(..., adjoint=)`` takes."""
+    """How derivatives are made: what ``deform(..., adjoint=)`` takes.
+
+    **Fields**
+
+    - needs_one_energy: True if it uses the gradient as that of one energy, which the normal term
+      does not have.
+    """
 
     needs_one_energy: ClassVar[bool]
-    """True if it uses the gradient as that of one energy, which the normal term does not have."""
 
     def check(self, solver: "Solver") -> None:
         """Raise InputError if derivatives cannot be made through this solver."""
@@ -56,12 +61,16 @@ class Adjoint(Protocol):
 
 @runtime_checkable
 class Solver(Protocol):
-    """How the reduced energy is minimised: what ``deform(..., solver=)`` takes."""
+    """How the reduced energy is minimised: what ``deform(..., solver=)`` takes.
+
+    **Fields**
+
+    - can_unroll: True if its iterations can be differentiated in forward and reverse mode.
+    - needs_one_energy: as for an adjoint.
+    """
 
     can_unroll: ClassVar[bool]
-    """True if its iterations can be differentiated in forward and reverse mode."""
     needs_one_energy: ClassVar[bool]
-    """As for an adjoint."""
 
     @property
     def default_adjoint(self) -> Adjoint:

@@ -135,16 +135,23 @@ class Newton(_Material):
     First quasi-Newton steps with the block diagonal of the Hessian, which in principal axes is
     nearly all of it (three scalars and three 2x2 blocks). Then, on the few cells that this does not
     solve, exact 9x9 steps.
+
+    **Fields**
+
+    - max_steps: bound on the exact steps of a cell; two are usual.
     """
 
     max_steps: int = 60
-    """Bound on the exact steps of a cell; two are usual."""
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
         """Return the minimisers T (3, 3, n)."""
         rotation = polar_rotation_of_grid(as_grid(c))
         m = product(as_grid(c), rotation)
         m = [[m[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]  # C R = U S U^T
+        # Squares of these numbers leave the range of float32 for meshes 1e10 long.
+        size = _size(b, rigidity)
+        m = [[v / size for v in row] for row in m]
+        b, rigidity = b / size[None], rigidity / size
         data = m, list(b), rigidity, gradient_tolerance(m, rigidity)
         x, unsolved = block_newton(*data)
         few = max(64, unsolved.shape[0] // 64)
@@ -163,10 +170,14 @@ class LBFGS(_Material):
     3,000 ran off to 1e100 and became NaN. So here the line search allows for rounding, steps
     without positive curvature are not remembered, and a step whose line search fails is refused.
     The cell goes on without memory; if that fails too, it is done.
+
+    **Fields**
+
+    - tolerance: stop at this gradient norm, relative to the cell's size (no less than 16 eps).
+    - max_steps: bound on the steps of a cell.
     """
 
     tolerance: float = 1e-10
-    """Stop at this gradient norm, relative to the cell's size (no less than 16 eps)."""
     max_steps: int = 200
 
     def __post_init__(self) -> None:
@@ -228,6 +239,10 @@ class GradientDescent(_Material):
 
     The step is one over a bound on the curvature along the way. The bound holds up to stretches of
     4; a step that raises the energy is refused and halved.
+
+    **Fields**
+
+    - max_steps: number of steps of each cell.
     """
 
     max_steps: int = 500
@@ -314,9 +329,13 @@ class AffineFit:
 
 def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:
     """Divide each cell's problem by its size, so that one tolerance fits all."""
-    size = rigidity + jnp.max(jnp.abs(b), axis=0)
-    size = jnp.where(size > 0, size, 1.0)
+    size = _size(b, rigidity)
     return c / size[None, None], b / size[None], rigidity / size
+
+
+def _size(b: Vectors, rigidity: Scalars) -> Scalars:
+    size = rigidity + jnp.max(jnp.abs(b), axis=0)
+    return jnp.where(size > 0, size, 1.0)
 
 
 def _energy_rounding(c, b, lam):

@@ -71,9 +71,10 @@ class _Hessian(NamedTuple):
         """Invert H; directions without stiffness get a floor."""
         t, b, rigidity = jax.lax.stop_gradient((t, b, rigidity))
         scale = rigidity + jnp.max(jnp.abs(b), axis=0)
-        floor = jnp.finfo(t.dtype).eps * scale + jnp.finfo(t.dtype).tiny
-        inverse = inverse_of_symmetric(half_hessian(t, b, rigidity), floor)
-        return _Hessian((as_grid(t), list(b), rigidity), inverse)
+        scale = jnp.where(scale > 0, scale, 1.0)
+        floor = jnp.full_like(scale, jnp.finfo(t.dtype).eps)
+        inverse = inverse_of_symmetric(half_hessian(t, b / scale[None], rigidity / scale), floor)
+        return _Hessian((as_grid(t), list(b), rigidity), inverse / scale[None, None])
 
     def solve(self, of: tuple[Grid, list[Array], Array], right: Matrices) -> Matrices:
         """Solve H dT = right, with the derivatives of H where it is ``of`` T, b and lambda."""

@@ -30,6 +30,21 @@ class QuasiNewton:
 
     Nocedal, "Updating quasi-Newton matrices with limited storage", 1980.
 
+    **Fields**
+
+    - tolerance: stop once a plain step is expected to lower the energy by less than this fraction
+      of it.
+    - max_steps: most iterations.
+    - history_length: number of past steps that shape the next one.
+    - metric: ``"stiffness"``: A^-1, the same for every rigidity. ``"material"``: a factor made for
+      this rigidity. It needs 1/3 to 1/30 of the steps where materials are soft, and its solves take
+      2 to 4 times as long. ``"auto"``: the second where a tenth of the cells is softer than a
+      constant of 1 (`rigidity_from_material`), on a CPU.
+    - leave_saddles: look for a direction of negative curvature at the end, and go on along it. It
+      costs 4 to 24 products with the Hessian, a quarter of the steps taken. Without it a symmetric
+      deformation may end at a saddle and say 'Converged'.
+    - can_unroll, needs_one_energy: see `Solver`.
+
     Example:
         >>> import jaxdeform as jd
         >>> jd.QuasiNewton(tolerance=1e-12).max_steps
@@ -37,21 +52,10 @@ class QuasiNewton:
     """
 
     tolerance: float = 1e-8
-    """Stop once a plain step is expected to lower the energy by less than this fraction of it."""
     max_steps: int = 500
-    """Most iterations."""
     history_length: int = 6
-    """Number of past steps that shape the next one."""
     metric: Choice = "auto"
-    """``"stiffness"``: A^-1, the same for every rigidity. ``"material"``: a factor made for this
-    rigidity. It needs 1/3 to 1/30 of the steps where materials are soft, and its solves take 2 to 4
-    times as long. ``"auto"``: the second where a tenth of the cells is softer than a constant of 1
-    (`rigidity_from_material`), on a CPU."""
-
     leave_saddles: bool = True
-    """Look for a direction of negative curvature at the end, and go on along it. It costs 4 to 24
-    products with the Hessian, a quarter of the steps taken. Without it a symmetric deformation may
-    end at a saddle and say 'Converged'."""
 
     can_unroll: ClassVar[bool] = False
     needs_one_energy: ClassVar[bool] = True

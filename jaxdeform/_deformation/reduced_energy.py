@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxdeform._deformation.geometry import Geometry, GeometryMaps
 from jaxdeform._deformation.local_step import LocalStep, solve_local_step
@@ -105,8 +105,8 @@ class ReducedEnergy:
         The edge changes B, so here the cells have other principal axes.
         """
         einsum = partial(jnp.einsum, precision="highest")
-        rest_normal = vertex_normals(system.rest, system.faces)
-        normal = vertex_normals(p, system.faces)
+        rest_normal = vertex_normals(system.rest, system)
+        normal = vertex_normals(p, system)
         axes = system.principal_axes
         b = einsum("iak,ak,jak->kij", axes, system.principal_moments, axes)
         b = b + einsum("ik,jk->kij", rest_normal, rest_normal)
@@ -136,13 +136,15 @@ def _felt(rigidity: Float[Array, "v"], moments: Float[Array, "3 v"]) -> Float[Ar
 
 
 def vertex_normals(
-    positions: Float[Array, "3 vertices"], faces: Int[Array, "faces 3"]
+    positions: Float[Array, "3 vertices"], system: System
 ) -> Float[Array, "3 vertices"]:
     """Return area-weighted unit normals; 0 where a vertex has no face."""
+    faces, sides = system.faces, system.sides
     a, b, c = (positions[:, faces[:, k]] for k in range(3))
     face_normal = jnp.cross(b - a, c - a, axis=0)
     normal = jnp.zeros_like(positions)
     for k in range(3):
-        normal = normal.at[:, faces[:, k]].add(face_normal)
+        seen = face_normal if sides is None else face_normal * sides[None, :, k]
+        normal = normal.at[:, faces[:, k]].add(seen)
     square = jnp.sum(normal**2, axis=0, keepdims=True)
     return normal / jnp.sqrt(jnp.where(square > 0, square, 1.0))

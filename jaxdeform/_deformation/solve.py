@@ -24,20 +24,26 @@ from jaxdeform._result import Result, succeeded
 
 
 class Solution(eqx.Module):
-    """A deformed mesh and how it was reached."""
+    """A deformed mesh and how it was reached.
+
+    **Fields**
+
+    - vertices: (*batch, vertices, 3) deformed positions p'.
+    - transforms: (*batch, vertices, 3, 3) T_k of every cell at these positions.
+    - energy: (*batch, history) reduced energy at the start and after each step; the last value
+      repeats once it stopped.
+    - steps: (*batch,) iterations done.
+    - result: what happened, a member of `Result`.
+    - flipped: (*batch,) number of cells that are inside out (det T <= 0): a part of the mesh is its
+      mirror image.
+    """
 
     vertices: Float[Array, "*batch vertices 3"]
-    """Deformed positions p'."""
     transforms: Float[Array, "*batch vertices 3 3"]
-    """T_k of every cell at these positions."""
     energy: Float[Array, "*batch history"]
-    """Reduced energy at the start and after each step; the last value repeats once it stopped."""
     steps: Int[Array, "*batch"]
-    """Iterations done."""
     result: Result
-    """What happened: a member of `Result`."""
     flipped: Int[Array, "*batch"]
-    """Number of cells that are inside out (det T <= 0): a part of the mesh is its mirror image."""
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:
@@ -99,7 +105,8 @@ def deform(
     - handle_weights: other weights of the soft handles than in `precompute`, one or
       (handles,), from 0 to those of `precompute` (whose factor stays, and bounds the energy
       from above). Entries of hard handles are not read. Differentiable.
-    - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods.
+    - normals: add the normal term of Eq. 4.7, which holds flat neighbourhoods. Faces need not agree
+      about the side, and on a Moebius band they cannot: around each vertex one side is chosen.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
       (the only one of QuasiNewton).
     - rest: (vertices, 3), the problem's own rest positions, given to be differentiated in: the

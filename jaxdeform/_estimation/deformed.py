@@ -13,6 +13,7 @@ from jaxdeform._deformation.known_solution import minimum_near
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.solve import deform
 from jaxdeform._estimation.poses import Poses
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import quick_jit
 
 
@@ -33,6 +34,8 @@ class PoseDerivatives(NamedTuple):
     """0 at vertices that do not count."""
     solver_error: Float[np.ndarray, "poses vertices 3"]
     """From the minimum to where the solver stopped; 0 at vertices that do not count."""
+    ends: list[State]
+    """Where the solver stopped in each pose."""
 
 
 def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoint) -> list[State]:
@@ -47,7 +50,7 @@ def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoi
         start = observed if isinstance(adjoint, Implicit) else None
         out = deform(problem, targets, field, solver=solver, adjoint=adjoint, start=start)
         found.append(State(out.vertices, out.transforms))
-    return found
+    return settled(found)
 
 
 def pose(problem, targets, field, state: State, solver, adjoint) -> Float[Array, "vertices 3"]:
@@ -64,10 +67,12 @@ def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDeri
     """
     theta = np.asarray(theta, problem.dtype)
     ends = states(problem, poses, np.exp(theta)[label], solver, adjoint)
-    each = [
-        _derivatives(problem, targets, label, theta, state, solver=solver, adjoint=adjoint)
-        for targets, state in zip(poses.targets, ends, strict=True)
-    ]
+    each = settled(
+        [
+            _derivatives(problem, targets, label, theta, state, solver=solver, adjoint=adjoint)
+            for targets, state in zip(poses.targets, ends, strict=True)
+        ]
+    )
     vertices, jacobian = (np.stack([np.asarray(one[k]) for one in each]) for k in range(2))
     counted = poses.counted[..., None]
     error = np.stack([np.asarray(state.vertices) for state in ends]) - vertices
@@ -76,6 +81,7 @@ def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDeri
         np.where(counted[..., None], jacobian, 0.0),
         residual_of(poses, vertices),
         np.where(counted, error, 0.0),
+        ends,
     )
 
 

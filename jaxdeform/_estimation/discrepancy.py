@@ -17,6 +17,8 @@ _FOREIGN = 0.03
 class Discrepancy(NamedTuple):
     """What the model leaves unexplained, beyond noise that is independent at every vertex.
 
+    **Fields**
+
     - found: whether there is any, by an F test at the level 1e-3.
     - p_value: of that test.
     - size: root mean square of the smooth part of the residual (a length).

@@ -39,6 +39,7 @@ from jaxdeform._estimation.poses import (
     same_length,
 )
 from jaxdeform._estimation.search import Found, search
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._result import Result, succeeded
 
 # The prior is strong at first and weakens by this factor a stage.
@@ -60,6 +61,8 @@ _NORMAL_95 = 1.959964
 @dataclass(frozen=True, eq=False)
 class FieldEstimate:
     """A rigidity per vertex, as `estimate_rigidity_field` finds it.
+
+    **Fields**
 
     - field: (vertices,) the rigidity of each vertex; its unit is length squared.
     - interval: (vertices, 2) 95 % interval of each, under the prior.
@@ -249,7 +252,7 @@ class _Linearised(NamedTuple):
 def _linearise(problem, poses: Poses, theta, solver, adjoint) -> _Linearised:
     ends = states(problem, poses, np.exp(theta), solver, adjoint)
     state = jax.tree.map(lambda *each: jnp.stack(each), *ends)
-    return _linearise_at(problem, poses, theta, state, solver, adjoint)
+    return settled(_linearise_at(problem, poses, theta, state, solver, adjoint))
 
 
 @eqx.filter_jit

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdeform._estimation.deformed import pose, states
+from jaxdeform._estimation.deformed import State, pose
 from jaxdeform._estimation.poses import Poses
 from jaxdeform._linalg.xla import quick_jit
 
@@ -58,11 +58,13 @@ class HandleNoise(NamedTuple):
 
 
 def find_handle_noise(
-    problem, poses: Poses, field, solver, adjoint, relative: float
+    problem, poses: Poses, field, ends: list[State], solver, adjoint, relative: float
 ) -> HandleNoise:
-    """Return the noise that targets pass on, which have so much more of it than the vertices."""
+    """Return the noise that targets pass on, which have so much more of it than the vertices.
+
+    ``ends`` are the deformations of this field.
+    """
     field = np.asarray(field, problem.dtype)
-    ends = states(problem, poses, field, solver, adjoint)
     count = min(_MODES, poses.targets[0].size)
     modes = [
         _modes(problem, targets, counted, field, end, count=count, solver=solver, adjoint=adjoint)

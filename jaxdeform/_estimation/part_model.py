@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation
-from jaxdeform._estimation.deformed import PoseDerivatives, deform_all, states
+from jaxdeform._estimation.deformed import PoseDerivatives, State, deform_all, states
 from jaxdeform._estimation.noise import HandleNoise
 from jaxdeform._estimation.poses import Poses, check_start, log_bounds
 
@@ -24,6 +24,7 @@ class Fit(NamedTuple):
     jacobian: Float[np.ndarray, "poses vertices 3 parts"]
     residual: Float[np.ndarray, "poses vertices 3"]
     solver_error: Float[np.ndarray, "poses vertices 3"]
+    ends: list[State]
     noise: HandleNoise
     """What the weights W allow for."""
     triangle: Float[np.ndarray, "rows columns"]
@@ -101,7 +102,8 @@ class PartModel:
         white = noise.whiten(columns.reshape(len(residual), -1, len(theta) + 1))
         triangle = np.asarray(np.linalg.qr(white.reshape(-1, len(theta) + 1), mode="r"))
         vertices, error = derivatives.vertices, derivatives.solver_error
-        return Fit(theta, vertices, jacobian, residual, error, noise, triangle)
+        ends = derivatives.ends
+        return Fit(theta, vertices, jacobian, residual, error, ends, noise, triangle)
 
     def positions(self, theta: np.ndarray) -> Float[np.ndarray, "poses vertices 3"]:
         """Deform into all poses, without derivatives."""

@@ -42,6 +42,8 @@ _VISIBLE = 0.01
 class Estimate:
     """Rigidity as observed poses tell it, with what they do not tell.
 
+    **Fields**
+
     - rigidity: (parts,) best value of each part; its unit is length squared.
     - material: (parts,) the same as a scale-free constant (`rigidity_from_material`).
     - interval: (parts, 2) 95 % interval of the rigidity of each part. It starts at 0 where the part
@@ -232,6 +234,7 @@ class _Search:
                 model.problem,
                 poses,
                 model.field(best.theta),
+                best.ends,
                 model.solver,
                 model.adjoint,
                 self.target_noise,

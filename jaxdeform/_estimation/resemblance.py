@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._errors import InputError
+from jaxdeform._mesh.grouping import summed
 
 # The typical edge of a pose is at most so many times as long as at rest, or as short. Inches for
 # centimetres make 2.5, which a real stretch can be too; the misfit tells.
@@ -54,8 +55,8 @@ def _check_orientation(problem: Problem, pose: int, positions, mask) -> None:
     both = both[mask[both].all(axis=1)]
     e = problem.mesh.vertices[both[:, 1]] - problem.mesh.vertices[both[:, 0]]
     moved = positions[both[:, 1]] - positions[both[:, 0]]
-    sums = lambda a, b: np.stack(  # noqa: E731
-        [np.bincount(both[:, 0], a[:, r] * b[:, c], n) for r in range(3) for c in range(3)], axis=1
+    sums = lambda a, b: summed(  # noqa: E731
+        (a[:, :, None] * b[:, None, :]).reshape(-1, 9), both[:, 0], n
     ).reshape(n, 3, 3)
     moments = sums(e, e)
     sizes = np.sqrt(np.maximum(np.linalg.eigvalsh(moments), 0.0))

@@ -9,20 +9,28 @@ from jaxtyping import Float, Int
 from jaxdeform._checks import check_tolerance, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.poses import read_poses
-from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.grouping import summed
+from jaxdeform._mesh.mesh import LARGEST, Mesh
 
 # Rounds of growing and fitting again. Real meshes need 3 to 8.
 _GROWTHS = 50
 
 
 class RigidGroup(NamedTuple):
-    """Vertices that moved together: ``p' = R p + t`` in every pose."""
+    """Vertices that moved together: ``p' = R p + t`` in every pose.
+
+    **Fields**
+
+    - vertices: (members,) indices, ascending.
+    - rotations: (poses, 3, 3) R.
+    - translations: (poses, 3) t.
+    - error: largest distance of a vertex from where that motion puts it.
+    """
 
     vertices: Int[np.ndarray, "members"]
     rotations: Float[np.ndarray, "poses 3 3"]
     translations: Float[np.ndarray, "poses 3"]
     error: float
-    """Largest distance of a vertex from where that motion puts it."""
 
     @property
     def degrees(self) -> Float[np.ndarray, "poses"]:
@@ -117,10 +125,12 @@ def find_handle_groups(
 
 def _check_deformed(deformed: ArrayLike, n: int) -> Float[np.ndarray, "poses vertices 3"]:
     poses = read_poses("deformed", deformed, n, np.dtype(np.float64))
-    bad = np.argwhere(~np.isfinite(poses).all(axis=2))
+    bad = np.argwhere(~(np.abs(poses) <= LARGEST).all(axis=2))
     if len(bad):
+        pose, vertex = bad[0]
         raise InputError(
-            f"deformed: vertex {bad[0][1]} of pose {bad[0][0]} is not finite: give real positions"
+            f"deformed: vertex {vertex} of pose {pose} is {poses[pose, vertex].tolist()}: give "
+            f"finite positions, up to {LARGEST:g}"
         )
     return poses
 
@@ -163,18 +173,14 @@ def _ring_errors(p, poses, graph: sp.csr_matrix) -> Float[np.ndarray, "vertices"
     error = np.zeros(n)
     for q in poses:
         moved = q[column] - q[row]
-        mean = [_sums(row, x, n) / count[:, None] for x in (edge, moved)]
+        mean = [summed(x, row, n) / count[:, None] for x in (edge, moved)]
         a, b = edge - mean[0][row], moved - mean[1][row]
         rotation = _rotations(
-            _sums(row, (b[:, :, None] * a[:, None, :]).reshape(-1, 9), n).reshape(n, 3, 3)
+            summed((b[:, :, None] * a[:, None, :]).reshape(-1, 9), row, n).reshape(n, 3, 3)
         )
         off = np.linalg.norm(np.einsum("eij,ej->ei", rotation[row], a) - b, axis=1)
         np.maximum.at(error, row, off)
     return np.where(count > 2, error, np.inf)
-
-
-def _sums(row, values, n: int) -> np.ndarray:
-    return np.stack([np.bincount(row, column, n) for column in values.T], axis=1)
 
 
 def _grow(p, poses, graph, seed: int | np.integer, reach: float, allowed) -> RigidGroup | None:

@@ -13,17 +13,24 @@ from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.deformed import residual_of
 from jaxdeform._estimation.poses import check_poses
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._result import Result
 
 
 class ThesisEstimate(NamedTuple):
-    """What `estimate_rigidity_thesis` returns."""
+    """What `estimate_rigidity_thesis` returns.
+
+    **Fields**
+
+    - rigidity: the last value; its unit is length squared.
+    - path: (evaluations,) rigidity at each evaluation.
+    - history: (evaluations,) Frobenius norm of the difference at each.
+    - result: how the search ended, a member of `Result`.
+    """
 
     rigidity: float
     path: Float[np.ndarray, "evaluations"]
-    """Rigidity at each evaluation."""
     history: Float[np.ndarray, "evaluations"]
-    """Frobenius norm of the difference at each."""
     result: Result
 
 
@@ -70,7 +77,7 @@ def estimate_rigidity_thesis(
     choose_adjoint(solver, None)
     rigidity, path, history = float(start), [], []
     for _ in range(max_evaluations):
-        vertices = deform(problem, poses.targets[0], rigidity, solver=solver).vertices
+        vertices = settled(deform(problem, poses.targets[0], rigidity, solver=solver).vertices)
         path.append(rigidity)
         history.append(float(np.linalg.norm(residual_of(poses, vertices[None]))))
         if not np.isfinite(history[-1]):

@@ -18,12 +18,16 @@ from jaxdeform._mesh.words import real
 
 
 class HandleFile(NamedTuple):
-    """Handles and their targets, as a file gives them."""
+    """Handles and their targets, as a file gives them.
+
+    **Fields**
+
+    - handles: (handles,) vertex indices.
+    - targets: (handles, 3) where each handle moves to, in the unit of the mesh.
+    """
 
     handles: Int[np.ndarray, "handles"]
-    """Vertex indices."""
     targets: Float[np.ndarray, "handles 3"]
-    """Where each handle moves to, in the unit of the mesh."""
 
 
 def load_handles(

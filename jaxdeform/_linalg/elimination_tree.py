@@ -12,6 +12,8 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
+from jaxdeform._mesh.grouping import distinct
+
 
 class Tree(NamedTuple):
     """The elimination tree: the node that eliminates each unknown."""
@@ -57,7 +59,7 @@ class Border(NamedTuple):
     @staticmethod
     def of(node, vertex, nodes: int, n: int) -> "Border":
         """Collect the pairs of node and vertex, each once."""
-        key = np.unique(node * n + vertex)
+        key = distinct(node * n + vertex)
         node, vertex = np.divmod(key, n)
         return Border(node, vertex, *_ranks(node, nodes), key, n)
 

@@ -12,6 +12,7 @@ Where the C header of the FFI is missing or unknown (ffi.py), and on GPUs and TP
 import atexit
 import contextlib
 import ctypes
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -81,7 +82,9 @@ def _leave() -> None:
     its thread, and XLA's client, when Python frees it, waits for that thread for ever.
     """
     if _used.is_set():
-        for array in jax.live_arrays("cpu"):
+        # Whoever pressed Ctrl-C waits for nothing. (The traceback keeps arrays alive.)
+        interrupted = isinstance(getattr(sys, "last_value", None), KeyboardInterrupt)
+        for array in [] if interrupted else jax.live_arrays("cpu"):
             with contextlib.suppress(Exception):
                 array.block_until_ready()
         # What runs now has results that nobody kept. It may fail, and the client is not freed.

@@ -131,14 +131,18 @@ def _turn(rotation: Matrices, c: Matrices, lean: list[Scalars]) -> Grid:
     r = as_grid(rotation)
     m = product(as_grid(c), r)
     trace = m[0][0] + m[1][1] + m[2][2]
+    # Without unit: the cube of a length squared leaves the range of float32 at 1e6 and 1e-6.
+    size = jnp.abs(trace)
+    inverse = 1.0 / jnp.where(size > 0, size, 1.0)
     s = [
-        [(trace if i == j else 0.0) - 0.5 * (m[i][j] + m[j][i]) for j in range(3)] for i in range(3)
+        [((trace if i == j else 0.0) - 0.5 * (m[i][j] + m[j][i])) * inverse for j in range(3)]
+        for i in range(3)
     ]
     cofactor = [cross(s[1], s[2]), cross(s[2], s[0]), cross(s[0], s[1])]
     det = inner(s[0], cofactor[0])
-    floor = jnp.finfo(c.dtype).eps * jnp.abs(trace) ** 3 + jnp.finfo(c.dtype).tiny
-    det = jnp.where(jnp.abs(det) > floor, det, jnp.inf)  # no unique rotation: the derivative is 0
-    w = [sum(cofactor[k][i] * lean[k] for k in range(3)) / det for i in range(3)]
+    # Where no rotation is unique, the derivative is 0.
+    det = jnp.where(jnp.abs(det) > jnp.finfo(c.dtype).eps, det, jnp.inf)
+    w = [sum(cofactor[k][i] * lean[k] for k in range(3)) * inverse / det for i in range(3)]
     zero = jnp.zeros_like(trace)
     return product(r, [[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
 

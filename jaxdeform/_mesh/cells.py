@@ -20,14 +20,17 @@ class Cells:
 
     Made by `rings` and `spokes`. Like the mesh, cells are a value: equal content makes
     them equal, in every process.
+
+    **Fields**
+
+    - mesh: the rest shape that the cells belong to.
+    - weights: (edges,) one weight per row of ``mesh.edges``; cotangent weights by default.
+    - membership: (vertices, edges) 1 where the edge belongs to the cell of the vertex.
     """
 
     mesh: Mesh
-    """The rest shape that the cells belong to."""
     weights: Float[np.ndarray, "edges"]
-    """One weight per row of ``mesh.edges``; cotangent weights by default."""
     membership: sp.csr_matrix
-    """(vertices, edges): 1 where the edge belongs to the cell of the vertex."""
 
     @property
     def edges(self) -> Int[np.ndarray, "edges 2"]:

@@ -13,10 +13,12 @@ from jaxtyping import Float, Int
 from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_rigidity, check_type, read_path
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.extras import file_extras
 from jaxdeform._mesh.formats import FORMATS
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform._mesh.parsed import Source
-from jaxdeform._mesh.ply import rewrite_ply, to_ply, vertex_columns
+from jaxdeform._mesh.parsed import Extras, Source
+from jaxdeform._mesh.ply import rewrite_ply, vertex_columns
+from jaxdeform._mesh.ply_writing import to_ply
 from jaxdeform._mesh.polygons import from_triangles, triangles
 from jaxdeform._mesh.reading import mark_of, read_bytes, without_mark
 from jaxdeform._mesh.stl import check_single_precision, is_binary
@@ -75,8 +77,10 @@ def save_mesh(
     A mesh that `load_mesh` read is written in the format of its file as that file with other
     positions: polygons, texture coordinates, colours, groups, materials, values per face and
     comments stay, and normals are computed anew. Without a change it is the same file, byte for
-    byte. In another format the polygons stay. For a plain file, write ``jd.Mesh(mesh.vertices,
-    mesh.faces)``. Files that the mesh names, such as an OBJ's ``mtllib``, are not copied.
+    byte. In another format the polygons stay, and colours (as bytes in PLY and OFF) and texture
+    coordinates (not in OFF) where it can hold them; a warning says what is lost. For a plain file,
+    write ``jd.Mesh(mesh.vertices, mesh.faces)``. Files that the mesh names, such as an OBJ's
+    ``mtllib``, are not copied.
 
     OBJ, OFF, text STL and PLY keep every bit: a PLY's ``float`` positions become ``double`` if they
     need more digits than ``float`` holds. Binary STL keeps single precision, with a warning if an
@@ -150,9 +154,25 @@ def _content(
         kept = mesh.source.polygons if mesh.source else None
         if kept is None or suffix == ".stl":
             kept = from_triangles(mesh.faces)
-        return to_bytes(points, kept)
+        return to_bytes(points, kept, _extras(path, suffix, mesh.source))
     data = without_mark(source.data)
     return mark_of(source.data) + rewrite(data, points, source.polygons)
+
+
+def _extras(path: Path, suffix: str, source: Source | None) -> Extras:
+    """Return what the new format holds of what the file had, with a warning for what is lost."""
+    found = file_extras(source)
+    names = {"colors": "colours", "texture": "texture coordinates"}
+    holds = FORMATS[suffix].holds
+    had = [name for name in names if getattr(found, name) is not None]
+    lost = [names[name] for name in had if name not in holds]
+    if lost:
+        warnings.warn(
+            f"{path}: {suffix[1:].upper()} cannot hold the {' and '.join(lost)} of the file that "
+            "the mesh was read from: they are not written; PLY and OBJ hold them",
+            stacklevel=4,
+        )
+    return found
 
 
 def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:

@@ -61,6 +61,11 @@ def _distances(mesh: Mesh, faces, sources) -> Float[np.ndarray, "vertices"]:
     reached = np.flatnonzero(np.isin(label, label[sources]) & mesh.referenced)
     if len(reached):
         on = sources[mesh.referenced[sources]]
-        out[reached] = igl.exact_geodesic(mesh.vertices, faces, on, none, reached, none)
+        # libigl has tolerances of its own: a bar 1e-20 long came out 15 % longer, one of 1e100 as
+        # 0, and one of 1e-100 did not end.
+        size = mesh.diagonal
+        unit = (mesh.vertices - mesh.center) / size
+        out[reached] = igl.exact_geodesic(unit, faces, on, none, reached, none)
+        out[reached] *= size
     out[sources] = 0.0
     return out

@@ -70,12 +70,16 @@ def repair(mesh: MeshLike) -> tuple[Mesh, Int[np.ndarray, "old"]]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What `inspect` found; ``str()`` turns it into a report."""
+    """What `inspect` found; ``str()`` turns it into a report.
+
+    **Fields**
+
+    - counts: sizes and measures by name: lengths in the unit of the mesh, angles in degrees.
+    - findings: what is wrong or unusual, one sentence each, and what jaxdeform does about it.
+    """
 
     counts: dict[str, int | float]
-    """Sizes and measures by name: lengths in the unit of the mesh, angles in degrees."""
     findings: tuple[str, ...]
-    """What is wrong or unusual, one sentence each, and what jaxdeform does about it."""
 
     def __str__(self) -> str:
         """Return the report."""
@@ -177,7 +181,11 @@ def _inspect_structure(points, faces, counts, report) -> None:
     ascending = np.where(directed[:, 0] < directed[:, 1], 1, -1)
     twist = np.bincount(inverse.ravel(), ascending)
     clash = int(((times == 2) & (twist != 0)).sum())
-    report(clash, "edges have faces of opposite orientation", "harmless without normals=True")
+    report(
+        clash,
+        "edges have faces of opposite orientation",
+        "harmless: around each vertex one side is chosen",
+    )
     center = points[used].mean(axis=0)
     a, b, c = (points[faces[:, k]] - center for k in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6

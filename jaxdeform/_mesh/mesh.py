@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxdeform._arrays import read_host_array, read_integers
 from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._mesh.grouping import distinct
 from jaxdeform._mesh.parsed import Source
 
 # A triangle has no area if its height is below this fraction of its longest edge: float64 cannot
@@ -19,6 +20,10 @@ from jaxdeform._mesh.parsed import Source
 _FLAT = 1e-13
 
 NO_AREA = "has no area"
+
+# Energies are squares of lengths, to be known to 16 digits: beyond this length, and below its
+# inverse, they leave the range of float64.
+LARGEST = 1e140
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -41,10 +46,19 @@ class Mesh:
     - faces: (faces, 3), vertex indices, counter-clockwise seen from outside.
     - source: what `load_mesh` remembers of a file with these faces, for `save_mesh`.
 
+    **Fields**
+
+    - vertices, faces: as given, but read-only.
+    - solid_faces: (solid, 3) the faces that have an area. Only these have edges, and so a part in
+      the energy.
+    - source: the file that the mesh was read from, so that it can be written with other positions.
+      It is pickled with the mesh, but meshes with the same numbers are equal whatever file they are
+      from: it changes no result.
+
     **Raises** InputError: an array is empty, has the wrong shape or is traced by JAX (see
     ``deform(rest=)`` for derivatives to the rest shape); a vertex is not finite; a face index is
-    out of range; a face repeats a vertex, or none has an area (`repair`); the source has
-    other faces.
+    out of range; a face repeats a vertex, or none has an area (`repair`); lengths above 1e140 or
+    below 1e-140; the source has other faces.
 
     Example:
         >>> import jaxdeform as jd
@@ -53,15 +67,9 @@ class Mesh:
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
-    """Positions, in any unit of length."""
     faces: Int[np.ndarray, "faces 3"]
-    """Vertex indices, counter-clockwise seen from outside."""
     solid_faces: Int[np.ndarray, "solid 3"]
-    """The faces that have an area. Only these have edges, and so a part in the energy."""
     source: Source | None
-    """The file that the mesh was read from, so that it can be written with other positions. It is
-    pickled with the mesh, but meshes with the same numbers are equal whatever file they are from:
-    it changes no result."""
 
     def __init__(
         self, vertices: ArrayLike, faces: ArrayLike, *, source: Source | None = None
@@ -170,7 +178,25 @@ def checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, n
             f"face {bad[0]} {corners[bad[0]].tolist()} names a vertex out of range: vertices "
             f"are 0 to {len(points) - 1}"
         )
+    _check_scale(points, corners)
     return points, corners
+
+
+def _check_scale(points: np.ndarray, corners: np.ndarray) -> None:
+    """Raise InputError where squares of lengths would leave the range of float64."""
+    far = np.abs(points).max(axis=1)
+    if far.max() > LARGEST:
+        k = int(far.argmax())
+        raise InputError(
+            f"vertex {k} is {points[k].tolist()}: squares of lengths above {LARGEST:g} leave the "
+            "range of float64; give the vertices in a larger unit of length"
+        )
+    size = np.ptp(points[corners.ravel()], axis=0).max()
+    if 0 < size < 1 / LARGEST:
+        raise InputError(
+            f"the mesh is {size:.3g} long: squares of lengths below {1 / LARGEST:g} leave the "
+            "range of float64; give the vertices in a smaller unit of length"
+        )
 
 
 def degenerate_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[str, int]]:
@@ -191,7 +217,7 @@ def unique_edges(faces: np.ndarray) -> Int[np.ndarray, "edges 2"]:
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     # Encode each pair as one number, because np.unique over rows is ten times slower.
     n = int(faces.max()) + 1
-    code = np.unique(pairs[:, 0] * n + pairs[:, 1])
+    code = distinct(pairs[:, 0] * n + pairs[:, 1])
     return np.stack([code // n, code % n], axis=1)
 
 

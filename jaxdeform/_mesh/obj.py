@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._errors import InputError
-from jaxdeform._mesh.parsed import Parsed
-from jaxdeform._mesh.polygons import Polygons, area_vectors, from_lists, summed, unit
+from jaxdeform._mesh.grouping import summed
+from jaxdeform._mesh.normals import corner_sides, corner_vectors
+from jaxdeform._mesh.parsed import Extras, Parsed
+from jaxdeform._mesh.polygons import Polygons, from_lists, unit
 from jaxdeform._mesh.words import (
     content,
     damaged,
@@ -80,11 +82,18 @@ def _face(path: Path, number: int, words: list[bytes]) -> list[int]:
         raise damaged(path, f"line {number} {excerpt(words)} is not a face") from None
 
 
-def to_obj(points: np.ndarray, polygons: Polygons) -> bytes:
+def to_obj(points: np.ndarray, polygons: Polygons, extras: Extras) -> bytes:
     """Return the content of a file."""
     lines = [f"# Vertices: {len(points)}", f"# Faces: {len(polygons.sizes)}"]
-    lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+    rows = points if extras.colors is None else np.concatenate([points, extras.colors], axis=1)
+    lines += ["v " + " ".join(map(repr, row)) for row in rows.tolist()]
     corners = list(map(str, (polygons.corners + 1).tolist()))
+    if extras.texture is not None:
+        has = ~np.isnan(extras.texture).any(axis=1)
+        pairs, index = np.unique(extras.texture[has], axis=0, return_inverse=True)
+        lines += [f"vt {u!r} {v!r}" for u, v in pairs.tolist()]
+        for k, named in zip(np.flatnonzero(has).tolist(), index.ravel().tolist(), strict=True):
+            corners[k] += f"/{named + 1}"
     at = 0
     for size in polygons.sizes.tolist():
         lines.append("f " + " ".join(corners[at : at + size]))
@@ -111,7 +120,7 @@ def rewrite_obj(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
         return b"".join(out)
     known: dict[bytes, int] = {}
     alike = [known.setdefault(b" ".join(_corner_words(lines[k])), len(known)) for k in at]
-    named = _named_normals(keywords, lines)
+    named = _named(keywords, lines, b"vn", 2)
     normals, index = _new_normals(points, polygons, named, np.array(alike))
     text = [[b"%.6f" % x for x in row] for row in normals.tolist()]
     used = np.isin(np.arange(len(normals)), index)
@@ -163,18 +172,46 @@ def _lines(path: Path | None, data: bytes) -> Iterator[tuple[int, bytes]]:
         yield len(lines), open_
 
 
-def _named_normals(keywords: list[bytes], lines: list[bytes]) -> Int[np.ndarray, "corners"]:
-    """Return the normal that each corner of each face names, or -1."""
+def color_words(data: bytes) -> list[list[bytes]]:
+    """Return the words behind the position of each vertex."""
+    rows = (line.split() for line in data.splitlines() if line.lstrip().startswith(b"v"))
+    return [row[4:7] for row in rows if row[0] == b"v"]
+
+
+def corner_texture(data: bytes, polygons: Polygons) -> Float[np.ndarray, "corners 2"] | None:
+    """Return the texture coordinates of each corner; NaN where it names none."""
+    lines = [line for _, line in _lines(None, data)]
+    keywords = [_keyword(_plain(line).split(None, 1)[:1]) for line in lines]
+    named = _named(keywords, lines, b"vt", 1)
+    words = [
+        content(_plain(line))[1:3]
+        for keyword, line in zip(keywords, lines, strict=True)
+        if keyword == b"vt"
+    ]
+    try:
+        pairs = np.array([[float(word) for word in (*row, b"0")[:2]] for row in words])
+    except ValueError:
+        return None
+    if not len(pairs) or pairs.shape[1:] != (2,) or len(named) != len(polygons.corners):
+        return None
+    there = (named >= 0) & (named < len(pairs))
+    return np.where(there[:, None], pairs[np.where(there, named, 0)], np.nan)
+
+
+def _named(
+    keywords: list[bytes], lines: list[bytes], kind: bytes, place: int
+) -> Int[np.ndarray, "corners"]:
+    """Return the line of this kind that each corner of each face names in that place, or -1."""
     named: list[int] = []
     count = 0
     for keyword, line in zip(keywords, lines, strict=True):
-        count += keyword == b"vn"
+        count += keyword == kind
         if keyword != b"f":
             continue
         for word in _corner_words(line):
             parts = word.split(b"/")
             try:
-                k = whole(parts[2])
+                k = whole(parts[place])
             except (IndexError, ValueError):
                 k = 0
             named.append(k - 1 if k > 0 else max(count + k, -1) if k < 0 else -1)
@@ -206,8 +243,13 @@ def _new_normals(
     named = np.where(named < count, named, -1)
     has = np.flatnonzero(named >= 0)
     vertex = polygons.corners[has]
-    vectors = np.repeat(area_vectors(points, polygons), polygons.sizes, axis=0)[has]
-    _, group = np.unique(alike[named[has]] * len(points) + vertex, return_inverse=True)
+    vectors = corner_vectors(points, polygons)[has]
+    key = alike[named[has]] * len(points) + vertex
+    _, first, group = np.unique(key, return_index=True, return_inverse=True)
+    sides = corner_sides(polygons)
+    if sides is not None:
+        side = sides[has]
+        vectors *= (side * side[first[group]])[:, None]  # the first face's, in each group
     sums = summed(vectors, group, int(group.max(initial=-1)) + 1)
     code = named[has] * len(points) + vertex
     pairs, one, inverse = np.unique(code, return_index=True, return_inverse=True)

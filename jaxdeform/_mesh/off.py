@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxdeform._errors import InputError
-from jaxdeform._mesh.parsed import Parsed
-from jaxdeform._mesh.polygons import Polygons, from_lists, vertex_normals
+from jaxdeform._mesh.normals import vertex_normals
+from jaxdeform._mesh.parsed import Extras, Parsed
+from jaxdeform._mesh.polygons import Polygons, from_lists
 from jaxdeform._mesh.words import (
     content,
     damaged,
@@ -57,10 +58,15 @@ def parse_off(path: Path, data: bytes) -> Parsed:
         raise damaged(path, "names a vertex out of range") from None
 
 
-def to_off(points: np.ndarray, polygons: Polygons) -> bytes:
-    """Return the content of a file."""
-    lines = ["OFF", f"{len(points)} {len(polygons.sizes)} 0"]
-    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+def to_off(points: np.ndarray, polygons: Polygons, extras: Extras) -> bytes:
+    """Return the content of a file; colours are bytes, as MeshLab, CGAL and Open3D write them."""
+    colors = extras.colors
+    lines = ["OFF" if colors is None else "COFF", f"{len(points)} {len(polygons.sizes)} 0"]
+    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+    if colors is not None:
+        shades = np.rint(255 * colors).astype(int).tolist()
+        rows = [f"{row} {r} {g} {b} 255" for row, (r, g, b) in zip(rows, shades, strict=True)]
+    lines += rows
     corners = list(map(str, polygons.corners.tolist()))
     at = 0
     for size in polygons.sizes.tolist():
@@ -84,7 +90,7 @@ def rewrite_off(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
 
 
 def color_words(data: bytes) -> list[list[bytes]]:
-    """Return the words of each vertex that say its colour, in files that have colours."""
+    """Return the words of each vertex that say its colour and opacity, if there are colours."""
     lines = data.splitlines()
     filled = _filled(lines)
     words = content(lines[filled[0]])
@@ -94,7 +100,7 @@ def color_words(data: bytes) -> list[list[bytes]]:
     count = whole((words[1:] or content(lines[filled[1]]))[0])
     begin = _body(lines, filled)
     at = 6 if kind[3] else 3
-    return [content(lines[k])[at : at + 3] for k in filled[begin : begin + count]]
+    return [content(lines[k])[at : at + 4] for k in filled[begin : begin + count]]
 
 
 def _filled(lines: list[bytes]) -> list[int]:

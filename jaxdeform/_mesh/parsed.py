@@ -18,6 +18,15 @@ class Parsed(NamedTuple):
     """The number of bytes behind the end of what the format describes."""
 
 
+class Extras(NamedTuple):
+    """What a file may say of a surface besides its shape, and another format can hold too."""
+
+    colors: Float[np.ndarray, "vertices 3"] | None = None
+    """Red, green and blue of each vertex, from 0 to 1."""
+    texture: Float[np.ndarray, "corners 2"] | None = None
+    """Texture coordinates of each corner of each polygon; NaN where there are none."""
+
+
 @dataclass(frozen=True, eq=False)
 class Source:
     """What a file held besides triangles, so that it can be written again with other positions."""

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxdeform._mesh.normals import vertex_normals
 from jaxdeform._mesh.parsed import Parsed
 from jaxdeform._mesh.ply_body import Field, binary_fields, text_place, text_rows
 from jaxdeform._mesh.ply_header import (
@@ -21,9 +22,8 @@ from jaxdeform._mesh.polygons import (
     from_lists,
     from_triangles,
     unit,
-    vertex_normals,
 )
-from jaxdeform._mesh.words import damaged, excerpt, joined, polygon, real, with_words
+from jaxdeform._mesh.words import damaged, excerpt, polygon, real, with_words
 
 _NORMAL = ("nx", "ny", "nz")
 
@@ -38,6 +38,12 @@ def parse_ply(path: Path, data: bytes) -> Parsed:
 def vertex_columns(path: Path, data: bytes) -> dict[str, Float[np.ndarray, "vertices"]]:
     """Return the properties of the vertices by name."""
     return _parse_body(path, data, parse_header(path, data))[0]
+
+
+def vertex_kinds(data: bytes) -> dict[str, str]:
+    """Return the types of the properties of the vertices by name."""
+    properties = parse_header(Path("its source"), data).vertex.properties
+    return {item.name: item.kind for item in properties}
 
 
 def _parse_body(path: Path, data: bytes, header: Header) -> tuple[dict, Polygons, int]:
@@ -129,38 +135,6 @@ def _strip_triangles(strips: Polygons) -> np.ndarray:
     a, b, c = rows.T
     # A strip is turned around a corner by naming a vertex twice: such triangles are none.
     return rows[(rows >= 0).all(axis=1) & (a != b) & (b != c) & (c != a)]
-
-
-def to_ply(points: np.ndarray, polygons: Polygons, rigidity: np.ndarray | None = None) -> bytes:
-    """Return the content of a binary file, with the vertex property rigidity if given."""
-    columns = dict(zip("xyz", points.T, strict=True))
-    if rigidity is not None:
-        columns["rigidity"] = np.broadcast_to(rigidity, len(points))
-    largest = int(polygons.sizes.max(initial=3))
-    count, width = ("uchar", "u1") if largest < 256 else ("int", "<i4")
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    lines += [f"property double {name}" for name in columns]
-    lines += [
-        f"element face {len(polygons.sizes)}",
-        f"property list {count} int vertex_indices",
-        "end_header",
-    ]
-    table = np.stack(list(columns.values()), axis=1).astype("<f8")
-    return joined(lines) + table.tobytes() + _face_bytes(polygons, width)
-
-
-def _face_bytes(polygons: Polygons, width: str) -> bytes:
-    """Return each polygon as its size and its corners."""
-    sizes, corners = polygons
-    wide = np.dtype(width).itemsize
-    begin = np.cumsum(wide + 4 * sizes) - (wide + 4 * sizes)
-    out = bytearray(int((wide + 4 * sizes).sum()))
-    one = np.ones_like(sizes)
-    Field(begin, one, np.dtype(width)).put(out, sizes)
-    within = np.arange(len(corners)) - np.repeat(polygons.starts, sizes)
-    places = np.repeat(begin + wide, sizes) + 4 * within
-    Field(places, np.ones_like(places), np.dtype("<i4")).put(out, corners)
-    return bytes(out)
 
 
 def rewrite_ply(

@@ -171,18 +171,3 @@ def unit(vectors: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, "rows 3"]:
     """Return the vectors with length one; zero stays zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)
-
-
-def vertex_normals(
-    points: Float[np.ndarray, "points 3"], polygons: Polygons
-) -> Float[np.ndarray, "points 3"]:
-    """Return unit normals: of all polygons at a vertex, weighted by their areas."""
-    vectors = np.repeat(area_vectors(points, polygons), polygons.sizes, axis=0)
-    return unit(summed(vectors, polygons.corners, len(points)))
-
-
-def summed(
-    vectors: Float[np.ndarray, "rows 3"], where: Int[np.ndarray, "rows"], count: int
-) -> Float[np.ndarray, "count 3"]:
-    """Return the sums of the rows that belong together."""
-    return np.stack([np.bincount(where, axis, count) for axis in vectors.T], axis=1)

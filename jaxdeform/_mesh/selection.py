@@ -24,6 +24,12 @@ class Selection:
     ``mesh.vertices[selection]``. (JAX's take ``selection.vertices``.) Its vertices are in ascending
     order. It is a value: two selections of the same vertices of equal meshes are equal.
 
+    **Fields**
+
+    - mesh: the mesh whose vertices they are.
+    - mask: (vertices,) True for each vertex of the selection. Read-only; for values per vertex,
+      such as ``np.where(selection.mask, 30.0, 0.01)``.
+
     Example:
         >>> import jaxdeform as jd
         >>> mesh = jd.shapes.bar()
@@ -35,10 +41,7 @@ class Selection:
     """
 
     mesh: Mesh
-    """The mesh whose vertices they are."""
     mask: Bool[np.ndarray, "vertices"]
-    """True for each vertex of the selection. Read-only; for values per vertex, such as
-    ``np.where(selection.mask, 30.0, 0.01)``."""
 
     # Else NumPy would work on the indices in ``mask & selection``, instead of asking __rand__.
     __array_ufunc__ = None

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxdeform._errors import InputError
 from jaxdeform._mesh.mesh import merge_equal_points
-from jaxdeform._mesh.parsed import Parsed
+from jaxdeform._mesh.parsed import Extras, Parsed
 from jaxdeform._mesh.polygons import (
     Polygons,
     area_vectors,
@@ -84,8 +84,9 @@ def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"]
     return stacked(corners), from_lists(sizes, list(range(used)))
 
 
-def to_stl(points: np.ndarray, polygons: Polygons) -> bytes:
+def to_stl(points: np.ndarray, polygons: Polygons, extras: Extras) -> bytes:
     """Return the content of a binary file, in single precision; the polygons are triangles."""
+    del extras  # it holds none
     facets = np.zeros(len(polygons.sizes), _FACET)
     head = b"STL".ljust(80) + len(facets).to_bytes(4, "little")
     return head + _filled(facets, points, polygons)

@@ -14,18 +14,22 @@ from jaxdeform._mesh.selection import read_mask
 
 @dataclass(frozen=True, eq=False)
 class Submesh:
-    """A piece of a mesh around the free vertices; made by `submesh`."""
+    """A piece of a mesh around the free vertices; made by `submesh`.
+
+    **Fields**
+
+    - mesh: the piece, as a mesh of its own.
+    - cells: the cells of the whole mesh that contain a free vertex; the other cells are empty.
+    - handles: (handles,) the vertices of the piece that are not free, by their index in the piece.
+    - index: (piece,) the index in the whole mesh of each vertex of the piece.
+    - whole: the mesh that the piece was cut from.
+    """
 
     mesh: Mesh
-    """The piece, as a mesh of its own."""
     cells: Cells
-    """The cells of the whole mesh that contain a free vertex; the other cells are empty."""
     handles: Int[np.ndarray, "handles"]
-    """The vertices of the piece that are not free, by their index in the piece."""
     index: Int[np.ndarray, "piece"]
-    """The index in the whole mesh of each vertex of the piece."""
     whole: Mesh
-    """The mesh that the piece was cut from."""
 
     def reinsert(
         self, vertices: ArrayLike, base: ArrayLike | None = None

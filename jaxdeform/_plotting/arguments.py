@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_flag, check_type, read_axis
 from jaxdeform._errors import InputError, a_or_an, shown
-from jaxdeform._mesh.colors import file_colors
+from jaxdeform._mesh.extras import file_colors
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import check_handles, read_mask
 from jaxdeform._plotting.camera import guess_up
@@ -147,7 +147,7 @@ def read_paint(
     numbers = _read_values(surface, poses, values)
     shown_ = [v for v, fault in zip(numbers, faults, strict=True) if v is not None and fault.frames]
     scale = scale_of(shown_) or scale_of([v for v in numbers if v is not None])
-    own = file_colors(surface.mesh)
+    own = file_colors(surface.mesh.source)
     plain = np.tile(rgb(NEUTRAL), (surface.mesh.n_vertices, 1)) if own is None else own
     colors = [plain if v is None or scale is None else scale.colors(v) for v in numbers]
     return Paint(colors, scale, label or (STRETCH if isinstance(values, str) else "rigidity"))

@@ -10,35 +10,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import lower_and_upper
 from PIL import Image
 
 import jaxdeform as jd
-from jaxdeform._apps.arguments import parts_by_place, read_pose
+from jaxdeform._apps.arguments import read_pose
 from jaxdeform._mesh.files import without_suffix
-
-
-def lower_and_upper(bar):
-    y = bar.vertices[:, 1]
-    return np.flatnonzero(y < 6), np.flatnonzero(y > 145)
-
-
-@pytest.fixture
-def files(tmp_path, bar):
-    """A bar, handles that bend it by 90 degrees (JSON and survey), a rigidity per vertex."""
-    jd.save_mesh(tmp_path / "bar.off", bar)
-    low, high = lower_and_upper(bar)
-    turn = {"axis": [0, 0, 1], "degrees": -90, "center": [0, 75.5, 0]}
-    groups = [{"vertices": low.tolist()}, {"vertices": high.tolist(), "rotation": turn}]
-    (tmp_path / "bend.json").write_text(json.dumps({"handles": groups}))
-    status = np.ones(722, int)
-    status[low], status[high] = 0, 2
-    (tmp_path / "bend.sel").write_text("\n".join(map(str, status)))
-    (tmp_path / "bend.def").write_text("0 1 0 -75.5\n-1 0 0 75.5\n0 0 1 0\n0 0 0 1\n")
-    values = np.where(bar.vertices[:, 1] < 75.5, 0.01, 30.0)
-    jd.save_mesh(tmp_path / "rigidity.ply", bar, rigidity=values)
-    jd.save_mesh(tmp_path / "short.ply", jd.shapes.square(), rigidity=1.0)
-    jd.save_mesh(tmp_path / "plain.ply", bar)
-    return tmp_path
 
 
 def drawn(path):
@@ -342,75 +319,3 @@ def test_what_stl_cannot_hold_is_refused_before_the_work_and_rescued_after(run, 
     assert "bent.stl: not written: STL keeps single" in err
     assert err.endswith(f"; the result is in {files}/bent.rescued.ply\n")
     assert jd.load_mesh(files / "bent.rescued.ply").n_vertices == 722
-
-
-def test_bad_files_of_parts(run, files, bar):
-    texts = {
-        "parts have shape (3,): give one integer per vertex, (722,)": "0 1 0",
-        "the part of vertex 0 is '1_0': give an integer": "1_0 " * 722,
-        "the part of vertex 1 is 1000000000, out of range": "0 1000000000 " * 361,
-        "the part of vertex 0 is '-0.5'": "-0.5 " * 722,
-        "the part of vertex 2 is -1": "0 0 -1 " + "0 " * 719,
-        "the part of vertex 0 is '" + "9" * 50: "9" * 5000 + " 0" * 721,
-        "no vertex belongs to part 0": "1 " * 722,
-    }
-    lists = {
-        "the part of vertex 0 is 0.5": [0.5, 1.7] * 361,
-        "the part of vertex 1 is True": [0, True] * 361,
-        "the part of vertex 0 is [0]": [[0]] * 722,
-        "give a list of one integer per vertex": {"0": 1},
-        "is not valid JSON": None,
-    }
-    for suffix, cases in ((".txt", texts), (".json", lists)):
-        for message, content in cases.items():
-            path = files / f"parts{suffix}"
-            text = content if suffix == ".txt" else json.dumps(content)
-            path.write_text("[" * 100_000 if content is None else str(text))
-            code, out, err = run(
-                "estimate", files / "bar.off", files / "bar.off", "-o", files / "o.ply",
-                "--parts", path,
-            )  # fmt: skip
-            assert (code, out) == (2, ""), message
-            assert f"parts{suffix}: {message}" in err
-            assert len(err) < 1100
-    # A byte-order mark does no harm, and neither do very long numbers.
-    path = files / "parts.json"
-    path.write_text("[" + ",".join(["9" * 5000] * 722) + "]", encoding="utf-8-sig")
-    code, _, err = run("estimate", files / "bar.off", files / "bar.off", "-o", files / "o.ply",
-                       "--parts", path)  # fmt: skip
-    assert code == 2
-    assert "parts.json: is not valid JSON (Exceeds the limit" in err
-
-
-def test_parts_by_expressions(run, files, bar):
-    y = bar.vertices[:, 1]
-    found = parts_by_place(["y > 50", "y > 100"], bar)
-    np.testing.assert_array_equal(found, np.where(y > 100, 2, np.where(y > 50, 1, 0)))
-    assert not parts_by_place([], bar).any()
-    two = "--part", "y < 50", "--part"
-    for message, words in {
-        "--part: 'y > 200' holds for no vertex: x runs from": ("--part", "y > 200"),
-        "--part: no vertex is left for part 0, what no --part names": (*two, "y >= 50"),
-        "--part: no vertex is left for part 1, 'y < 50'": (*two, "y < 60"),
-        "--part and --parts are two ways": ("--part", "y > 50", "--parts", files / "p.txt"),
-    }.items():
-        code, out, err = run(
-            "estimate", files / "bar.off", files / "bar.off", "-o", files / "o.ply", *words
-        )
-        assert (code, out) == (2, "")
-        assert err.startswith(f"jaxdeform: {message}")
-
-
-@pytest.mark.slow
-def test_estimate_by_expressions_and_by_files_is_the_same(run, files, bar):
-    bent = "--handles", files / "bend.json", "--rigidity", files / "rigidity.ply"
-    pose, label = files / "pose.ply", (bar.vertices[:, 1] > 75.5).astype(int)
-    run("deform", files / "bar.off", *bent, "-o", pose)
-    (files / "p.txt").write_text(" ".join(map(str, label)))
-    found = []
-    for words in (("--parts", files / "p.txt"), ("--part", "y > 75.5")):
-        code, _, err = run("estimate", files / "bar.off", pose, "-o", files / "fit.ply", *words)
-        assert (code, err) == (0, "")
-        found.append(jd.load_rigidity(files / "fit.ply"))
-    np.testing.assert_array_equal(*found)
-    np.testing.assert_allclose(found[0], np.where(label, 30.0, 0.01), rtol=0.05)

@@ -28,7 +28,7 @@ class LinearModel(PartModel):
         counted = self.poses.counted[..., None]
         residual = np.where(counted, vertices - self.poses.observed, 0.0)
         jacobian = np.where(counted[..., None], self.slopes, 0.0)
-        found = PoseDerivatives(vertices, jacobian, residual, np.zeros_like(residual))
+        found = PoseDerivatives(vertices, jacobian, residual, np.zeros_like(residual), [])
         return self.weighted(theta, found, noise)
 
 

@@ -1,14 +1,10 @@
-"""Known materials recovered, intervals that cover, verdicts, misuse, the command."""
-
-import json
-import sys
+"""Known materials recovered, intervals that cover, verdicts, misuse."""
 
 import numpy as np
 import pytest
 from helpers import THESIS, noisy
 
 import jaxdeform as jd
-from jaxdeform._apps import cli
 from jaxdeform._estimation.parts import check_parts
 from jaxdeform._estimation.poses import check_poses
 
@@ -186,87 +182,6 @@ def test_misuse_is_told_at_once(bar, bar_problem):
     for call, message in cases:
         with pytest.raises(jd.InputError, match=message):
             call()
-
-
-# ---------------------------------------------------------------- the command
-
-
-def run_cli(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["jaxdeform", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return int(stop.value.code or 0)
-
-
-def test_command_estimates_parts_and_writes_them(
-    monkeypatch, tmp_path, capsys, bar, pose_of, halves
-):
-    rest, pose, out = (tmp_path / name for name in ("rest.ply", "pose.ply", "out.ply"))
-    jd.save_mesh(rest, bar)
-    jd.save_mesh(pose, bar, vertices=pose_of(np.array([0.5, 30.0])[halves]))
-    (tmp_path / "parts.txt").write_text("\n".join(map(str, halves)))
-    options = ["--parts", tmp_path / "parts.txt", "--steps", 100, "-o", out]
-    assert run_cli(monkeypatch, "estimate", rest, pose, *options) == 0
-    np.testing.assert_allclose(jd.load_rigidity(out), np.array([0.5, 30.0])[halves], rtol=1e-6)
-    report = json.loads((tmp_path / "out.json").read_text())
-    assert [round(part["rigidity"], 4) for part in report["parts"]] == [0.5, 30.0]
-    assert report["result"]["ok"]
-    shown = capsys.readouterr().out
-    assert "2 groups of vertices moved rigidly (73, 73)" in shown
-    assert "evaluation 1:" in shown
-
-
-@pytest.mark.slow
-def test_command_predicts_a_pose_that_was_held_out(monkeypatch, tmp_path, capsys, bar, bar_problem):
-    """A soft bar, fitted on a bend: its twist is predicted, and ARAP's is another."""
-    names = [tmp_path / f"{name}.ply" for name in ("rest", "bend", "twist")]
-    points = bar.vertices[bar_problem.handles]
-    jd.save_mesh(names[0], bar)
-    for name, targets in zip(
-        names[1:], (jd.bend(points, 60.0), jd.twist(points, 60.0)), strict=True
-    ):
-        pose = jd.deform(bar_problem, targets, 0.3).vertices
-        jd.save_mesh(name, bar, vertices=pose)
-    options = ["--hold-out", 1, "-o", tmp_path / "out.ply"]
-    assert run_cli(monkeypatch, "estimate", *names, *options) == 0
-    shown = capsys.readouterr().out
-    (line,) = [line for line in shown.splitlines() if "twist.ply" in line]
-    ours, arap = (float(word) for word in line.replace("\u2502", " ").split()[1:3])
-    assert ours < 0.01 < arap
-    assert run_cli(monkeypatch, "estimate", *names, "--hold-out", 2, "-o", tmp_path / "o.ply") == 2
-    assert "--hold-out 2 leaves none of the 2 poses" in capsys.readouterr().err
-
-
-def test_command_refuses_what_does_not_fit(monkeypatch, tmp_path, capsys, bar):
-    rest, other, out = (tmp_path / name for name in ("rest.ply", "other.ply", "out.ply"))
-    jd.save_mesh(rest, bar)
-    jd.save_mesh(other, jd.Mesh(bar.vertices, bar.faces[::-1]))
-    (tmp_path / "short.txt").write_text("0 1 0")
-    for name, text in {
-        "words.json": '["soft"]',
-        "halves.json": "[0.5, 1.7" + ", 0" * 720 + "]",
-        "huge.json": "[1000000000" + ", 0" * 721 + "]",
-        "deep.json": "[" * 100_000,
-        "keys.json": '{"0": 1}',
-        "marks.txt": "1_0" + " 0" * 721,
-    }.items():
-        (tmp_path / name).write_text(text)
-    out.write_text("kept")
-    for arguments, message in (
-        ([rest, other, "-o", out], "other.ply: is not a pose of"),
-        ([rest, rest, "-o", tmp_path / "out.obj"], "only PLY"),
-        ([rest, rest, "-o", out, "--parts", tmp_path / "short.txt"], "parts have shape"),
-        (
-            [rest, rest, "-o", out, "--parts", tmp_path / "words.json"],
-            "words.json: the part of vertex 0 is 'soft'",
-        ),
-        ([rest, tmp_path / "none.ply", "-o", out], "none.ply"),
-    ):
-        assert run_cli(monkeypatch, "estimate", *arguments) == 2
-        told = capsys.readouterr().err
-        assert message in told
-        assert told.count("\n") == 1
-    assert out.read_text() == "kept"
 
 
 def test_selections_and_masks_stand_for_parts_and_for_what_was_seen(bar, bar_problem, halves):

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -64,6 +65,14 @@ def test_programs_are_kept_for_the_next_process(run, expected, folder):
 
 def test_a_process_may_end_while_deformations_run(run, expected):
     np.testing.assert_array_equal(run("hurried"), expected)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to a process of its own")
+def test_ctrl_c_is_heard_while_jax_computes(run):
+    """And the process ends, though the deformation would go on for half an hour."""
+    with pytest.raises(subprocess.CalledProcessError) as error:
+        run("interrupted")
+    assert error.value.returncode == -signal.SIGINT
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ def test_bad_arrays_are_named():
         assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("scale", [1e-200, 1.0, 1e200])
+@pytest.mark.parametrize("scale", [1e-130, 1.0, 1e130])
 def test_what_has_no_area_does_not_depend_on_the_unit(scale):
     thin = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0]])
     jd.Mesh(scale * thin, [[0, 1, 2]])

@@ -185,7 +185,7 @@ def test_polygons_of_all_sizes_in_their_order(tmp_path):
     assert at == len(faces)
 
 
-@pytest.mark.parametrize("scale", [1e-160, 1e-30, 1e30, 1e300])
+@pytest.mark.parametrize("scale", [1e-130, 1e-30, 1e30, 1e130])
 def test_a_cut_does_not_depend_on_the_unit(tmp_path, scale):
     points = in_space(np.array(SHAPES["U"], float))
     want = loaded(tmp_path, points, range(8)).faces

@@ -6,7 +6,7 @@ from PIL import Image
 from pixels import WIDTH, close_to, ink, panels
 
 import jaxdeform as jd
-from jaxdeform._mesh.colors import file_colors
+from jaxdeform._mesh.extras import file_colors
 from jaxdeform._plotting.arguments import find_faults
 from jaxdeform._plotting.color import RAMP
 from jaxdeform._plotting.scene import FIXED, MOVED
@@ -105,7 +105,7 @@ def test_the_colours_of_the_file(kind, tmp_path):
     path = tmp_path / f"mesh.{kind}"
     path.write_text(given[kind])
     mesh = jd.load_mesh(path)
-    np.testing.assert_allclose(file_colors(mesh), [[1, 0, 0], [0, 1, 0], [0, 0, 0.2]])
+    np.testing.assert_allclose(file_colors(mesh.source), [[1, 0, 0], [0, 1, 0], [0, 0, 0.2]])
     jd.render(tmp_path / "out.png", mesh, [mesh.vertices], width=40)
     image = np.asarray(Image.open(tmp_path / "out.png"), int)
     assert (image[..., 0] > image[..., 1] + 90).any()
@@ -115,8 +115,8 @@ def test_the_colours_of_the_file(kind, tmp_path):
 def test_without_colours_in_the_file(tmp_path, bar):
     for name in ("bar.obj", "bar.off", "bar.ply", "bar.stl"):
         jd.save_mesh(tmp_path / name, bar)
-        assert file_colors(jd.load_mesh(tmp_path / name)) is None
-    assert file_colors(bar) is None
+        assert file_colors(jd.load_mesh(tmp_path / name).source) is None
+    assert file_colors(bar.source) is None
 
 
 def test_panels_wrap_into_rows(drawn, bar):
