@@ -2,15 +2,16 @@
 
 import os
 import time
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import typer
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import make_folder
-from jaxdeform._apps.batch.manifest import read_manifest
+from jaxdeform._apps.batch.manifest import Job, read_manifest
 from jaxdeform._apps.talk import console, counted, patiently, since
 from jaxdeform._errors import printable
 
@@ -54,43 +55,70 @@ def batch(
 ) -> None:
     """Do many jobs: deformations and fits of many meshes. The same command goes on after a stop."""
     try:
-        from jaxdeform._apps.batch import run, store, summary, worker
+        import distributed  # noqa: F401
+        import pyarrow  # noqa: F401
+        import zarr  # noqa: F401
     except ImportError as error:
         raise jd.InputError(f"{MISSING} ({error})") from error
-
-    def existing(name: str):
-        root = store.find(name)
-        if root is None or not store.is_run(root) or not root.attrs.get("complete"):
-            raise jd.InputError(f"{name}: is no run: give the folder that -o named")
-        return root, store.jobs_of(root)
-
     if status is not None:
-        root, jobs = existing(status)
-        done, failed, total = summary.count(root, jobs)
-        console.print(f"{done} of {total} jobs done, {failed} of them failed")
-        return
-    if out is None:
+        _tell(status)
+    elif out is None:
         raise jd.InputError("give the folder of the run with -o")
-    if export is not None:
-        root, jobs = existing(export)
-        make_folder(Path(out))
-        written = summary.export(root, jobs, Path(out), f".{suffix.lstrip('.').lower()}")
-        console.print(f"wrote {written} meshes to {printable(out)}")
-        return
-    if manifest is None:
+    elif export is not None:
+        _export(export, Path(out), f".{suffix.lstrip('.').lower()}")
+    elif manifest is None:
         raise jd.InputError("give a manifest: a CSV, JSON lines or Parquet file")
+    else:
+        count = workers or max(1, (os.cpu_count() or 2) // 2)
+        _run(manifest, out, _Options(tries, time_limit, scheduler, count, csv))
+
+
+class _Options(NamedTuple):
+    tries: int
+    time_limit: float
+    scheduler: str | None
+    workers: int
+    csv: bool
+
+
+def _existing(name: str) -> tuple[Any, list[Job]]:
+    """Return the store and the jobs of a run."""
+    from jaxdeform._apps.batch import store
+
+    root = store.find(name)
+    if root is None or not store.is_run(root) or not root.attrs.get("complete"):
+        raise jd.InputError(f"{name}: is no run: give the folder that -o named")
+    return root, store.jobs_of(root)
+
+
+def _tell(run: str) -> None:
+    from jaxdeform._apps.batch import summary
+
+    done, failed, total = summary.count(*_existing(run))
+    console.print(f"{done} of {total} jobs done, {failed} of them failed")
+
+
+def _export(run: str, folder: Path, suffix: str) -> None:
+    from jaxdeform._apps.batch import summary
+
+    root, jobs = _existing(run)
+    make_folder(folder)
+    written = summary.export(root, jobs, folder, suffix)
+    console.print(f"wrote {written} meshes to {printable(str(folder))}")
+
+
+def _run(manifest: Path, out: str, options: _Options) -> None:
+    from jaxdeform._apps.batch import run, summary
+    from jaxdeform._apps.batch.worker import Settings
+
     began = time.perf_counter()
     jobs = read_manifest(manifest)
     root = patiently("planning", lambda: run.planned(out, jobs))
     cache = bool(jax.config.values.get("jax_compilation_cache_dir"))  # cli.py has set it
-    settings = worker.Settings(out, run.new_session(), tries, time_limit, cache)
-    count = workers or max(1, (os.cpu_count() or 2) // 2)
-    counted(
-        "jobs",
-        len(jobs),
-        lambda tell: run.go_on(root, jobs, settings, scheduler, count, tell, console.print),
-    )
-    names = summary.write_table(out, summary.table(root, jobs), csv)
+    settings = Settings(out, run.new_session(), options.tries, options.time_limit, cache)
+    go_on = partial(run.go_on, root, jobs, settings, options.scheduler, options.workers)
+    counted("jobs", len(jobs), lambda tell: go_on(tell, console.print))
+    names = summary.write_table(out, summary.table(root, jobs), options.csv)
     done, failed, total = summary.count(root, jobs)
     console.print(f"{done} of {total} jobs done, {failed} of them failed, in {since(began)}")
     console.print(f"wrote {printable(', '.join(names))}")
