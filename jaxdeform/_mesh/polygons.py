@@ -85,13 +85,15 @@ def _cut(
     out = np.empty((m, n - 2, 3), np.int64)
     for begin in range(0, m, step):
         part = slice(begin, begin + step)
-        # Halved, and scaled before products are taken: no number leaves the range of float64.
-        corner = points[table[part]] / 2
-        corner -= corner[:, :1].copy()
-        scale = np.abs(corner).max(axis=(1, 2), keepdims=True)
-        corner = corner / np.where(scale > 0, scale, 1.0)
-        flat = _flattened(corner)
-        out[part] = _best(corner, flat) if n <= _ALL_WAYS else [cut_ears(shape) for shape in flat]
+        with np.errstate(invalid="ignore"):  # who reads refuses what is not finite
+            # Halved, and scaled before products are taken: no number leaves the range of float64.
+            corner = points[table[part]] / 2
+            corner -= corner[:, :1].copy()
+            scale = np.abs(corner).max(axis=(1, 2), keepdims=True)
+            corner = corner / np.where(scale > 0, scale, 1.0)
+            flat = _flattened(corner)
+            cut = _best(corner, flat) if n <= _ALL_WAYS else [cut_ears(shape) for shape in flat]
+        out[part] = cut
     return out
 
 
