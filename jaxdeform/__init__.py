@@ -19,6 +19,7 @@ from jaxdeform._baselines.skinning_weights import (
     inverse_distance_weights,
     rigid_weights,
 )
+from jaxdeform._baselines.sr_arap import sr_arap
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.batch import deform_batch, deform_in_chunks
@@ -136,6 +137,7 @@ __all__ = [
     "select",
     "shapes",
     "spokes",
+    "sr_arap",
     "submesh",
     "translate",
     "twist",

@@ -187,6 +187,10 @@ def good_calls(folder: Path) -> dict:
         "inverse_distance_weights": (jd.inverse_distance_weights, {**WEIGHTS, "power": 2.0}),
         "arap": (jd.arap, rigid),
         "rc_arap": (jd.rc_arap, {**rigid, "r": 1}),
+        "sr_arap": (
+            jd.sr_arap,
+            {**rigid, "alpha": 0.02, "tolerance": 1e-3, "max_steps": 3, "steps": 3},
+        ),
         "laplacian_editing": (jd.laplacian_editing, {**edit, "targets": TARGETS}),
         "laplacian_editor": (jd.laplacian_editor, edit),
         "linear_blend_skinning": (jd.linear_blend_skinning, SKIN),
@@ -294,7 +298,7 @@ OF_KIND = {
     "indices": "faces group parts r",
     "vertices": "free handles moved sources",
     "count": "columns count history_length memory max_evaluations max_steps steps width",
-    "tolerance": "determined_within distance radius seconds smoothness step_size "
+    "tolerance": "alpha determined_within distance radius seconds smoothness step_size "
     "target_noise threshold tolerance",
     "path": "path motion",
     "setting": "adjoint local solver",

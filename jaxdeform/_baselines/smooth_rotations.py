@@ -1,0 +1,273 @@
+"""The iteration of smooth-rotation ARAP, and the derivative of where it ends.
+
+The energy is Eq. 3.3 with a second term, in which the rotations of neighbours pull at each other:
+
+    E(p', R) = sum_i sum_{j in N(i)} w_ij |e'_ij - R_i e_ij|^2
+               + alpha sum_{edges ij} b_ij |R_i - R_j|_F^2.
+
+The local step fits all rotations at once, to the positions and to the rotations of the last
+iteration. Taken alone that can raise the energy: two neighbours may exchange their rotations for
+ever. So a cell counts its own last rotation too, as much as all its neighbours together. The
+matrix of the coupling is then positive semidefinite, so the quadratic term in R lies above its
+tangent, and no step raises the energy. The stationary points are the same, because ``|R_i|^2`` is
+constant.
+
+Rotations are in the principal axes of their cells (covariance.py).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxdeform._deformation.cell_energy import cell_energies
+from jaxdeform._deformation.descent import Descent
+from jaxdeform._deformation.local_step import RotationFit, solve_local_step
+from jaxdeform._deformation.problem import System
+from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
+from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._linalg.lbfgs import has_converged
+from jaxdeform._linalg.rotations import rotation_matrices
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._result import Result
+
+# Of the linear system of the derivative: the residual that ends it, and that of the Newton step.
+_TOLERANCE, _NEWTON_TOLERANCE = 1e-10, 1e-2
+_MAX_STEPS = 2000
+
+
+class SmoothEnergy(NamedTuple):
+    """The function that is minimised, as arrays."""
+
+    system: System
+    coupling: EllMatrix
+    """b, with its row sums on the diagonal."""
+    row_sum: Float[Array, "vertices"]
+    alpha: Float[Array, ""]
+
+    @staticmethod
+    def build(system: System, mesh: Mesh, alpha: float, dtype: np.dtype) -> "SmoothEnergy":
+        """Return the energy with ``b_ij = area (1 / n_i + 1 / n_j) / 2``.
+
+        area is that of the mesh, n_i the number of neighbours of vertex i. The unit of b is that
+        of covariances, length squared.
+        """
+        n, (i, j) = mesh.n_vertices, mesh.edges.T
+        corner = mesh.vertices[mesh.faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        area = 0.5 * np.linalg.norm(normal, axis=1).sum()
+        neighbours = np.bincount(mesh.edges.ravel(), minlength=n)
+        b = 0.5 * area * (1.0 / neighbours[i] + 1.0 / neighbours[j])
+        upper = sp.coo_matrix((b, (i, j)), (n, n))
+        both = upper + upper.T
+        row_sum = np.asarray(both.sum(axis=1)).ravel()
+        coupling = EllMatrix.build([[sp.csr_matrix(both + sp.diags(row_sum))]], dtype)
+        return SmoothEnergy(
+            system, coupling, jnp.asarray(row_sum, dtype), jnp.asarray(alpha, dtype)
+        )
+
+    def pull(self, t: Float[Array, "3 3 v"]) -> Float[Array, "3 3 v"]:
+        """Return ``alpha sum_j b_ij (R_j + R_i)``: a symmetric and semidefinite map of R."""
+        axes = self.system.principal_axes
+        world = jnp.einsum("aik,jik->ajk", t, axes, precision="highest")
+        world = self.alpha * self.coupling.apply(world)
+        return jnp.einsum("ajk,jik->aik", world, axes, precision="highest")
+
+    def value(
+        self, p: Float[Array, "3 v"], t: Float[Array, "3 3 v"], pull: Float[Array, "3 3 v"]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return the energy, given ``pull(t)``, and the size of its rounding error."""
+        system = self.system
+        c, none = system.covariance(p), jnp.zeros_like(self.row_sum)
+        cells = jnp.sum(cell_energies(t, c, system.principal_moments, none))
+        stretch = jnp.sum(p * system.stiffness.apply(p))
+        # |R_i - R_j|^2 = |R_i|^2 + |R_j|^2 - 2 <R_i, R_j>; every edge has two ends.
+        twice = 2.0 * self.alpha * jnp.sum(self.row_sum[None, None] * t * t)
+        rounding = 20.0 * jnp.finfo(p.dtype).eps * (stretch + twice)
+        return stretch + cells + twice - jnp.sum(t * pull), rounding
+
+
+class _State(NamedTuple):
+    """What one iteration hands to the next."""
+
+    p: Float[Array, "3 vertices"]
+    transforms: Float[Array, "3 3 vertices"]
+    energy: Float[Array, ""]
+    done: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+    @staticmethod
+    def before(start: Float[Array, "3 vertices"]) -> "_State":
+        """Return the state before the first step, in which nothing pulls at the rotations."""
+        transforms = jnp.zeros((3, *start.shape), start.dtype)
+        zero = jnp.zeros((), start.dtype)
+        return _State(start, transforms, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))
+
+
+def _advance(
+    energy: SmoothEnergy, state: _State, is_last: Bool[Array, ""], tolerance: float | None
+) -> _State:
+    """Fit the rotations, and move the vertices unless this is the end."""
+    system, p, last = energy.system, state.p, state.transforms
+    pulled = energy.pull(last)
+    c = system.covariance(p)
+    moments, none = system.principal_moments, jnp.zeros_like(p[0])
+    t = solve_local_step(RotationFit(), c + jnp.swapaxes(pulled, 0, 1), moments, none)
+    turned = energy.pull(t - last)
+    value, rounding = energy.value(p, t, pulled + turned)
+    gradient = system.stiffness.apply(p) - system.covariance.transpose(t)
+    gradient = jnp.where(system.free[None], gradient, 0.0)
+    move = system.factor.solve(gradient)
+    # As in Alternating: the last finite p stays, and only the cells at fault are NaN.
+    done = is_last | jnp.isnan(value)
+    if tolerance is not None:
+        # What this step gains, as squares, which rounding leaves exact: where R maximises
+        # <R, M>, and so M = R S with S symmetric, 2 <R - R_last, M> = <R - R_last, (R - R_last) S>.
+        change = t - last
+        size = jnp.einsum("aik,ajk->ijk", t, jnp.swapaxes(c, 0, 1) + pulled, precision="highest")
+        by_turning = jnp.einsum("aik,ijk->ajk", change, size, precision="highest") + turned
+        gain = jnp.sum(gradient * move) + jnp.sum(change * by_turning)
+        done |= has_converged(gain, value, rounding, tolerance)
+        done |= value <= rounding  # a rigid motion, of energy 0
+    p = jnp.where(done, p, p - move)
+    return _State(p, t, value, done, state.steps + jnp.where(done, 0, 1))
+
+
+def unrolled(energy: SmoothEnergy, start: Float[Array, "3 vertices"], steps: int) -> Descent:
+    """Iterate a number of times, as a scan that both modes of differentiation go through."""
+
+    @jax.checkpoint
+    def advance(state, index):
+        return _advance(energy, state, index == steps, None)
+
+    def body(state, index):
+        state = advance(state, index)
+        return state, state.energy
+
+    indices = jnp.arange(steps + 1, dtype=jnp.int32)
+    end, history = jax.lax.scan(body, _State.before(start), indices)
+    return Descent(end.p, end.transforms, history, end.steps, Result.steps_done)
+
+
+def to_convergence(
+    energy: SmoothEnergy, start: Float[Array, "3 vertices"], tolerance: float, most: int
+) -> Descent:
+    """Iterate until a step gains less than the tolerance."""
+
+    def body(carry):
+        index, state, history = carry
+        state = _advance(energy, state, index == most, tolerance)
+        return index + 1, state, history.at[index].set(state.energy)
+
+    history = jnp.zeros(most + 1, start.dtype)
+    begin = jnp.asarray(0, jnp.int32), _State.before(start), history
+    _, end, history = jax.lax.while_loop(lambda carry: ~carry[1].done, body, begin)
+    result = Result.where(end.steps < most, Result.converged, Result.step_limit)
+    return Descent(end.p, end.transforms, history, end.steps, result)
+
+
+def with_derivative_of_minimum(
+    energy: SmoothEnergy,
+    targets: Float[Array, "3 vertices"],
+    p: Float[Array, "3 vertices"],
+    t: Float[Array, "3 3 vertices"],
+) -> tuple[Float[Array, "3 vertices"], Float[Array, "3 3 vertices"]]:
+    """Return p and T, known to be the minimum for these targets, with the derivatives of that.
+
+    By the implicit function theorem on the gradient to positions and to small turns w, with
+    ``T(w) = T exp([w]x)``. Its Hessian is symmetric, so one conjugate gradient method serves
+    forward and reverse mode. As in `Implicit`, derivatives are taken one Newton step further, and
+    are NaN where the linear system is not solved.
+    """
+
+    @jax.custom_jvp
+    def minimum(energy, targets, p, t):
+        del energy, targets
+        return p, t
+
+    @minimum.defjvp
+    def minimum_jvp(primals, tangents):
+        energy, targets, *_ = primals
+        known = minimum(*primals)  # so that this rule has derivatives too
+        at, there = jax.lax.stop_gradient(((energy, targets), known))
+        hessian, precondition = _hessian(*at, *there)
+        error = _slope(*at, *there)(_at_rest(known[0]), at[1])
+        step, left = _conjugate_gradients(hessian, precondition, -error, _NEWTON_TOLERANCE)
+        step = jnp.where(left <= _NEWTON_TOLERANCE, step, 0.0)
+        p, t = known[0] + step[0], _turned(known[1], step[1])
+
+        zero, slope = _at_rest(p), _slope(energy, targets, p, t)
+        _, right = jax.jvp(lambda targets: slope(zero, targets), (targets,), (tangents[1],))
+        move = _solve(*_hessian(energy, targets, p, t), -right)
+        moved = jnp.where(energy.system.free[None], move[0], tangents[1])
+        _, turned = jax.jvp(lambda w: _turned(t, w), (zero[1],), (move[1],))
+        return (p, t), (moved, turned)
+
+    return minimum(energy, targets, p, t)
+
+
+def _at_rest(p: Float[Array, "3 v"]) -> Float[Array, "2 3 v"]:
+    """Return no displacement, and no turn."""
+    return jnp.zeros((2, *p.shape), p.dtype)
+
+
+def _turned(t: Float[Array, "3 3 v"], w: Float[Array, "3 v"]) -> Float[Array, "3 3 v"]:
+    return jnp.einsum("aik,kij->ajk", t, rotation_matrices(w.T), precision="highest")
+
+
+def _slope(energy: SmoothEnergy, targets, p, t):
+    """Return half the gradient of the energy as a function of (u, w) and the targets.
+
+    The free vertices are at p + u, and the rotations are T(w).
+    """
+    system = energy.system
+
+    def half_energy(x, targets):
+        moved, turned = jnp.where(system.free[None], p + x[0], targets), _turned(t, x[1])
+        stretch = jnp.sum(moved * system.stiffness.apply(moved))
+        c = jnp.swapaxes(system.covariance(moved), 0, 1)
+        return 0.5 * stretch - jnp.sum(turned * (c + 0.5 * energy.pull(turned)))
+
+    return jax.grad(half_energy)
+
+
+def _hessian(energy: SmoothEnergy, targets, p, t):
+    """Return the Hessian as a function, and a preconditioner: A for u, the size of C for w."""
+    system, slope = energy.system, _slope(energy, targets, p, t)
+    _, hessian = jax.linearize(lambda x: slope(x, targets), _at_rest(p))
+    c = jnp.swapaxes(system.covariance(p), 0, 1)
+    size = jax.lax.stop_gradient(jnp.sum(t * (c + energy.pull(t)), axis=(0, 1)))
+    point = ~(size > 0)  # an unreferenced vertex has no rotation
+
+    def multiply(x):
+        return hessian(x) + jnp.stack([system.held(x[0]), jnp.where(point[None], x[1], 0.0)])
+
+    def precondition(x):
+        turn = x[1] / jnp.where(point, 1.0, size)[None]
+        return jnp.stack([system.factor.solve(x[0]) + system.held(x[0]), turn])
+
+    return multiply, precondition
+
+
+def _solve(multiply, precondition, right):
+    """Return the solution with the derivatives of it; NaN if it was not found."""
+    tolerance = max(_TOLERANCE, 20 * float(jnp.finfo(right.dtype).eps))
+
+    def solve(multiply, right):
+        solution, left = _conjugate_gradients(multiply, precondition, right, tolerance)
+        return jnp.where(left <= max(100.0 * tolerance, 1e-6), solution, jnp.nan)
+
+    return jax.lax.custom_linear_solve(multiply, right, solve, symmetric=True)
+
+
+def _conjugate_gradients(multiply, precondition, right, tolerance: float):
+    def flat(function):
+        return lambda x: function(x.reshape(right.shape)).reshape(3, -1)
+
+    x, left = conjugate_gradients(
+        flat(multiply), flat(precondition), right.reshape(3, -1), tolerance, _MAX_STEPS
+    )
+    return x.reshape(right.shape), left

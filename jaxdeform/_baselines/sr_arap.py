@@ -1,0 +1,134 @@
+"""ARAP with smooth rotations in one call (Levi and Gotsman 2015)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdeform._baselines.smooth_rotations import (
+    SmoothEnergy,
+    to_convergence,
+    unrolled,
+    with_derivative_of_minimum,
+)
+from jaxdeform._checks import check_count, check_tolerance, check_type
+from jaxdeform._deformation.arguments import from_center, read_inputs
+from jaxdeform._deformation.problem import precompute
+from jaxdeform._deformation.reduced_energy import Inputs
+from jaxdeform._deformation.solve import Solution, guess, without_derivative
+from jaxdeform._deformation.verdict import inside_out, verdict
+from jaxdeform._errors import ArrayLike
+from jaxdeform._linalg.xla import AS_FAST, quick_jit
+from jaxdeform._mesh.cells import spokes
+from jaxdeform._mesh.mesh import Mesh
+
+
+def sr_arap(
+    mesh: Mesh,
+    handles: ArrayLike,
+    targets: ArrayLike,
+    alpha: float = 0.02,
+    *,
+    weights: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    tolerance: float = 1e-8,
+    max_steps: int = 5000,
+    steps: int | None = None,
+) -> Solution:
+    """Deform as rigidly as possible with rotations that vary smoothly, once.
+
+    Levi and Gotsman, "Smooth rotation enhanced as-rigid-as-possible mesh animation" (2015),
+    doi:10.1109/TVCG.2014.2359463. To the energy of `arap` it adds
+    ``alpha sum_{edges ij} b_ij |R_i - R_j|_F^2`` with ``b_ij = area (1 / n_i + 1 / n_j) / 2``:
+    area is that of the mesh, n_i the number of neighbours of vertex i. Where all vertices have the
+    same number of neighbours, alpha is that of CGAL. (CGAL gives vertex i the weight ``1 / n_i``
+    alone, so that its steps are no descent of an energy.)
+
+    Local and global steps alternate, and no step raises the energy. Unlike `arap`, it does not
+    look whether the end is a saddle.
+
+    A function of the targets and the start, under jit and vmap too. By default it goes to
+    convergence, and the derivatives to the targets are those of the minimum (jvp, grad and
+    higher). With ``steps`` they are those of that many steps, to the targets and the start.
+    Nothing else has a derivative.
+
+    **Arguments**
+
+    - mesh: the rest shape.
+    - handles: (handles,) vertex indices, a mask or a selection.
+    - targets: (handles, 3), in the unit of the mesh.
+    - alpha: 0 or more, without unit. 0 is ARAP; the larger, the more equal are the rotations.
+    - weights: (edges,), as in `spokes`; by default cotangent weights, where negative ones count
+      as 0.
+    - start: (vertices, 3), the first guess; by default Laplacian editing.
+    - tolerance: stop once a step gains less than this fraction of the energy.
+    - max_steps: stop after that many steps all the same.
+    - steps: take this many steps instead, whatever they gain.
+
+    **Returns** a `Solution`: ``transforms`` are the rotations, ``energy`` includes their term.
+    Numerical trouble comes back in its ``result``.
+
+    **Raises** InputError as `precompute` does; targets or start of the wrong shape or not finite;
+    alpha, the tolerance or a number of steps out of range.
+
+    Example:
+        >>> import jaxdeform as jd
+        >>> mesh = jd.shapes.bar()
+        >>> handles = jd.select.where(mesh, "y < 6 or y > 145")
+        >>> out = jd.sr_arap(mesh, handles, jd.bend(mesh.vertices[handles], 90.0))
+        >>> out.vertices.shape
+        (722, 3)
+    """
+    check_type("mesh", mesh, Mesh)
+    alpha = check_tolerance("alpha", alpha)
+    tolerance = check_tolerance("tolerance", tolerance)
+    max_steps = check_count("max_steps", max_steps)
+    if steps is not None:
+        steps = check_count("steps", steps)
+    problem = precompute(mesh, handles, cells=spokes(mesh, weights=weights))
+    relative = from_center(problem, "targets", targets, (len(problem.handles), 3), "handle")
+    inputs = read_inputs(problem, relative, 0.0, None)
+    if start is not None:
+        start = from_center(problem, "start", start, (problem.n_vertices, 3), "vertex")
+    energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
+    how = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
+    return _solve_at_once(energy, inputs, start, **how)
+
+
+def _solve(
+    energy: SmoothEnergy,
+    inputs: Inputs,
+    start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
+    *,
+    tolerance: float,
+    max_steps: int,
+    steps: int | None,
+) -> Solution:
+    energy = energy._replace(system=without_derivative(energy.system))
+    system, targets = energy.system, inputs.targets
+    if start is None:
+        start = system.rest + guess(system, targets - system.rest)
+    start = jnp.where(system.free[None], start, targets)
+    if steps is None:
+        known = jax.lax.stop_gradient((energy, start))
+        end = jax.lax.stop_gradient(to_convergence(*known, tolerance, max_steps))
+        p, t = with_derivative_of_minimum(energy, targets, end.positions, end.transforms)
+        value, _ = energy.value(p, t, energy.pull(t))
+        end = end._replace(positions=p, transforms=t)
+    else:
+        end = unrolled(energy, start, steps)
+        value = end.energy[end.steps]
+    after = jnp.arange(end.energy.shape[0], dtype=end.steps.dtype) >= end.steps
+    return Solution(
+        vertices=(end.positions + system.center[:, None]).T,
+        transforms=jnp.einsum(
+            "aik,jik->kaj", end.transforms, system.principal_axes, precision="highest"
+        ),
+        energy=jnp.where(after, value, end.energy),
+        steps=end.steps,
+        result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
+        flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
+    )
+
+
+_solve_at_once = quick_jit(static=("tolerance", "max_steps", "steps"), options=AS_FAST)(_solve)
