@@ -37,8 +37,8 @@ def sr_arap(
 ) -> Solution:
     """Deform as rigidly as possible with rotations that vary smoothly, once.
 
-    Levi and Gotsman, "Smooth rotation enhanced as-rigid-as-possible mesh animation" (2015),
-    doi:10.1109/TVCG.2014.2359463. To the energy of `arap` it adds
+    Levi and Gotsman, "Smooth rotation enhanced as-rigid-as-possible mesh animation" (2015). To the
+    energy of `arap` it adds
     ``alpha sum_{edges ij} b_ij |R_i - R_j|_F^2`` with ``b_ij = area (1 / n_i + 1 / n_j) / 2``:
     area is that of the mesh, n_i the number of neighbours of vertex i. Where all vertices have the
     same number of neighbours, alpha is that of CGAL. (CGAL gives vertex i the weight ``1 / n_i``
