@@ -33,7 +33,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
     Polygons with more than three corners are cut into triangles for the work: a quad along its
     shorter diagonal, any other with short diagonals that stay inside; one that is not planar, as
-    its shadow in its mean plane. The mesh remembers its file (`Mesh.source`), so that
+    its shadow in its mean plane. The mesh remembers its file (``source``), so that
     `save_mesh` writes the polygons, and all else that the file held, as they were.
 
     STL stores no shared vertices, so corners that are exactly equal are merged. A file that holds
