@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxdeform._deformation.cell_energy import cell_energies
-from jaxdeform._deformation.descent import Descent
+from jaxdeform._deformation.descent import Descent, Iterate
 from jaxdeform._deformation.local_step import RotationFit, solve_local_step
 from jaxdeform._deformation.problem import System
 from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
@@ -90,26 +90,9 @@ class SmoothEnergy(NamedTuple):
         return stretch + cells + twice - jnp.sum(t * pull), rounding
 
 
-class _State(NamedTuple):
-    """What one iteration hands to the next."""
-
-    p: Float[Array, "3 vertices"]
-    transforms: Float[Array, "3 3 vertices"]
-    energy: Float[Array, ""]
-    done: Bool[Array, ""]
-    steps: Int[Array, ""]
-
-    @staticmethod
-    def before(start: Float[Array, "3 vertices"]) -> "_State":
-        """Return the state before the first step, in which nothing pulls at the rotations."""
-        transforms = jnp.zeros((3, *start.shape), start.dtype)
-        zero = jnp.zeros((), start.dtype)
-        return _State(start, transforms, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))
-
-
 def _advance(
-    energy: SmoothEnergy, state: _State, is_last: Bool[Array, ""], tolerance: float | None
-) -> _State:
+    energy: SmoothEnergy, state: Iterate, is_last: Bool[Array, ""], tolerance: float | None
+) -> Iterate:
     """Fit the rotations, and move the vertices unless this is the end."""
     system, p, last = energy.system, state.p, state.transforms
     pulled = energy.pull(last)
@@ -133,7 +116,7 @@ def _advance(
         done |= has_converged(gain, value, rounding, tolerance)
         done |= value <= rounding  # a rigid motion, of energy 0
     p = jnp.where(done, p, p - move)
-    return _State(p, t, value, done, state.steps + jnp.where(done, 0, 1))
+    return Iterate(p, t, value, done, state.steps + jnp.where(done, 0, 1))
 
 
 def unrolled(energy: SmoothEnergy, start: Float[Array, "3 vertices"], steps: int) -> Descent:
@@ -148,7 +131,7 @@ def unrolled(energy: SmoothEnergy, start: Float[Array, "3 vertices"], steps: int
         return state, state.energy
 
     indices = jnp.arange(steps + 1, dtype=jnp.int32)
-    end, history = jax.lax.scan(body, _State.before(start), indices)
+    end, history = jax.lax.scan(body, Iterate.before(start), indices)
     return Descent(end.p, end.transforms, history, end.steps, Result.steps_done)
 
 
@@ -163,7 +146,7 @@ def to_convergence(
         return index + 1, state, history.at[index].set(state.energy)
 
     history = jnp.zeros(most + 1, start.dtype)
-    begin = jnp.asarray(0, jnp.int32), _State.before(start), history
+    begin = jnp.asarray(0, jnp.int32), Iterate.before(start), history
     _, end, history = jax.lax.while_loop(lambda carry: ~carry[1].done, body, begin)
     result = Result.where(end.steps < most, Result.converged, Result.step_limit)
     return Descent(end.p, end.transforms, history, end.steps, result)

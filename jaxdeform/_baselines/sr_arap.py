@@ -15,8 +15,7 @@ from jaxdeform._checks import check_count, check_tolerance, check_type
 from jaxdeform._deformation.arguments import from_center, read_inputs
 from jaxdeform._deformation.problem import precompute
 from jaxdeform._deformation.reduced_energy import Inputs
-from jaxdeform._deformation.solve import Solution, guess, without_derivative
-from jaxdeform._deformation.verdict import inside_out, verdict
+from jaxdeform._deformation.solve import Solution, guess, solution_of, without_derivative
 from jaxdeform._errors import ArrayLike
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._mesh.cells import spokes
@@ -118,17 +117,7 @@ def _solve(
     else:
         end = unrolled(energy, start, steps)
         value = end.energy[end.steps]
-    after = jnp.arange(end.energy.shape[0], dtype=end.steps.dtype) >= end.steps
-    return Solution(
-        vertices=(end.positions + system.center[:, None]).T,
-        transforms=jnp.einsum(
-            "aik,jik->kaj", end.transforms, system.principal_axes, precision="highest"
-        ),
-        energy=jnp.where(after, value, end.energy),
-        steps=end.steps,
-        result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
-        flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
-    )
+    return solution_of(system, inputs, end, value)
 
 
 _solve_at_once = quick_jit(static=("tolerance", "max_steps", "steps"), options=AS_FAST)(_solve)

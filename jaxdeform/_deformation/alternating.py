@@ -1,15 +1,15 @@
 """The thesis's iteration: local step, global step (Sec. 4.1.1)."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.adjoint import Unrolled
-from jaxdeform._deformation.descent import Descent
+from jaxdeform._deformation.descent import Descent, Iterate
 from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._linalg.lbfgs import has_converged
@@ -76,11 +76,11 @@ class Alternating:
             # A^-1 K^T T as a correction of p, so that rounding errors do not accumulate.
             return jnp.where(done, p, p - move), at.transforms, at.energy, done
 
-        def advance(state: _State, index) -> _State:
+        def advance(state: Iterate, index) -> Iterate:
             p, transforms, value, done = step(state.p, index == self.steps)
-            return _State(p, transforms, value, done, state.steps + jnp.where(done, 0, 1))
+            return Iterate(p, transforms, value, done, state.steps + jnp.where(done, 0, 1))
 
-        def body(state: _State, index):
+        def body(state: Iterate, index):
             if self.tolerance is None:
                 state = advance(state, index)
             else:
@@ -90,26 +90,9 @@ class Alternating:
         # One iteration more than steps: the last one evaluates the end, so that the local step is
         # compiled once.
         end, history = jax.lax.scan(
-            body, _State.before(start), jnp.arange(self.steps + 1, dtype=jnp.int32)
+            body, Iterate.before(start), jnp.arange(self.steps + 1, dtype=jnp.int32)
         )
         result = Result.steps_done
         if self.tolerance is not None:
             result = Result.where(end.steps < self.steps, Result.converged, Result.step_limit)
         return Descent(end.p, end.transforms, history, end.steps, result)
-
-
-class _State(NamedTuple):
-    """What one iteration hands to the next."""
-
-    p: Float[Array, "3 vertices"]
-    transforms: Float[Array, "3 3 vertices"]
-    energy: Float[Array, ""]
-    done: Bool[Array, ""]
-    steps: Int[Array, ""]
-
-    @staticmethod
-    def before(start: Float[Array, "3 vertices"]) -> "_State":
-        """Return the state before the first evaluation."""
-        transforms = jnp.zeros((3, *start.shape), start.dtype)
-        zero = jnp.zeros((), start.dtype)
-        return _State(start, transforms, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))

@@ -90,18 +90,8 @@ def deform_batch(
     """
     check_flag("throw", throw)
     check_function("progress", progress, "members done, members")
-    chunks = deform_in_chunks(
-        problem,
-        targets,
-        rigidity,
-        local=local,
-        solver=solver,
-        start=start,
-        handle_weights=handle_weights,
-        normals=normals,
-        memory=memory,
-    )
-    total = _Batch.read(problem, targets, rigidity, start).size
+    settings = local, solver, normals, memory
+    total, chunks = _planned(problem, targets, rigidity, start, handle_weights, *settings)
     done = []
     for members, part in chunks:
         done.append(part)
@@ -145,12 +135,21 @@ def deform_in_chunks(
         >>> bool((heights > 100).all())
         True
     """
+    settings = local, solver, normals, memory
+    return _planned(problem, targets, rigidity, start, handle_weights, *settings)[1]
+
+
+def _planned(
+    problem, targets, rigidity, start, handle_weights, local, solver, normals, memory
+) -> tuple[int, Iterator[tuple[slice, Solution]]]:
+    """Check all arguments; return the number of members, and the chunks, none begun."""
     check_problem(problem)
     check_count("memory of the chunks, in bytes,", memory, most=2**62)
     how = read_settings(local, solver, None, normals)
     soft = read_weights(problem, handle_weights)
     batch = _Batch.read(problem, targets, rigidity, start)
-    return _chunks(problem, batch, soft, how, _size_of_chunk(problem, batch.size, memory))
+    length = _size_of_chunk(problem, batch.size, memory)
+    return batch.size, _chunks(problem, batch, soft, how, length)
 
 
 class _Batch(NamedTuple):
@@ -165,7 +164,6 @@ class _Batch(NamedTuple):
     def read(
         problem: Problem, targets: ArrayLike, rigidity: ArrayLike, start: ArrayLike | None
     ) -> "_Batch":
-        check_problem(problem)
         if not all(map(is_concrete, jax.tree.leaves(problem))):
             raise InputError(
                 "problem: traced by JAX (jit, vmap or grad), but a batch is computed at once: use "

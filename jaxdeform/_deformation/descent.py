@@ -2,7 +2,8 @@
 
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-from jaxtyping import Array, Float, Int
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._checks import check_setting
 from jaxdeform._deformation.problem import System
@@ -20,6 +21,23 @@ class Descent(NamedTuple):
     """At the start and after each step; anything behind the last one."""
     steps: Int[Array, ""]
     result: Result
+
+
+class Iterate(NamedTuple):
+    """What one iteration hands to the next."""
+
+    p: Float[Array, "3 vertices"]
+    transforms: Float[Array, "3 3 vertices"]
+    energy: Float[Array, ""]
+    done: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+    @staticmethod
+    def before(start: Float[Array, "3 vertices"]) -> "Iterate":
+        """Return the state before the first evaluation."""
+        transforms = jnp.zeros((3, *start.shape), start.dtype)
+        zero = jnp.zeros((), start.dtype)
+        return Iterate(start, transforms, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))
 
 
 class Anchor(NamedTuple):

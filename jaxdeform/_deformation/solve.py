@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._checks import check_flag, check_positions, check_rigidity
 from jaxdeform._deformation.arguments import Settings, from_center, read_inputs, read_settings
 from jaxdeform._deformation.cell_energy import cell_energies
-from jaxdeform._deformation.descent import Adjoint, Anchor, Solver
+from jaxdeform._deformation.descent import Adjoint, Anchor, Descent, Solver
 from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.problem import Problem, System, check_problem
@@ -213,22 +213,26 @@ def descend(
     energy, solver, adjoint = how
     start = jnp.where(system.free[None], start, inputs.targets)
     end, anchor = adjoint.solve(solver, energy, system, inputs, start)
-    p, steps = end.positions, end.steps
+    p = end.positions
     transforms, value = _with_derivatives_at_end(
-        energy, system, inputs, anchor, end.transforms, end.energy[steps]
+        energy, system, inputs, anchor, end.transforms, end.energy[end.steps]
     )
-    after = jnp.arange(end.energy.shape[0], dtype=steps.dtype) >= steps
-    solution = Solution(
-        vertices=(p + system.center[:, None]).T,
+    return solution_of(system, inputs, end._replace(transforms=transforms), value), p
+
+
+def solution_of(system: System, inputs: Inputs, end: Descent, value: Float[Array, ""]) -> Solution:
+    """Return what a user gets of a descent, whose last energy is ``value``."""
+    after = jnp.arange(end.energy.shape[0], dtype=end.steps.dtype) >= end.steps
+    return Solution(
+        vertices=(end.positions + system.center[:, None]).T,
         transforms=jnp.einsum(
-            "aik,jik->kaj", transforms, system.principal_axes, precision="highest"
+            "aik,jik->kaj", end.transforms, system.principal_axes, precision="highest"
         ),
         energy=jnp.where(after, value, end.energy),
-        steps=steps,
+        steps=end.steps,
         result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
         flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
     )
-    return solution, p
 
 
 @jax.custom_jvp

@@ -24,13 +24,13 @@ Root = Any
 
 FOLDER = "results.zarr"
 LAYOUT = 1
-# Codes of the array `result`: the members of `Result`, and two of the run's own.
+# Codes of the array `result`: the members of `Result`, and one of the run's own.
 CODES = (*MEMBERS, "failed")
-WAITING = -1
+FAILED, WAITING = len(MEMBERS), -1
 # Jobs that are written together: as many as are lost where a worker is killed.
 JOBS_IN_BLOCK = 8
 _BLOCK_BYTES = 2**25
-_SCALARS = {
+SCALARS = {
     "result": ("int16", WAITING),
     "energy": ("float64", np.nan),
     "misfit": ("float64", np.nan),
@@ -103,7 +103,7 @@ def _make_group(root: Root, number: int, name: str, rows: list[int]) -> None:
             fill_value=np.nan,
             dimension_names=names[: 1 + len(shape)],
         )
-    for field, (dtype, fill) in _SCALARS.items():
+    for field, (dtype, fill) in SCALARS.items():
         group.create_array(
             field,
             shape=(count,),
@@ -161,10 +161,14 @@ def jobs_of(root: Root) -> list[Job]:
     return [Job.of_json(line) for line in _text(root["manifest"]).splitlines()]
 
 
+def groups(root: Root) -> list[Root]:
+    """Return the group of each mesh, in order."""
+    return [root[f"mesh_{number}"] for number in range(int(root.attrs["meshes"]))]
+
+
 def blocks(root: Root, jobs: list[Job]) -> Iterator[tuple[Block, bool]]:
     """Return all blocks, and whether each is done."""
-    for mesh in range(int(root.attrs["meshes"])):
-        group = root[f"mesh_{mesh}"]
+    for mesh, group in enumerate(groups(root)):
         rows, result = group["row"][:], group["result"]
         each, codes = result.chunks[0], result[:]
         for number, first in enumerate(range(0, len(rows), each)):
@@ -187,7 +191,7 @@ def write(root: Root, block: Block, done: Sequence[Done | str]) -> None:
         np.full((n, 3), np.nan), np.full(n, np.nan), np.nan, np.nan, 0, 0, "failed", np.nan
     )
     full = [blank if isinstance(x, str) else x for x in done]
-    for field in ("vertices", "rigidity", *reversed(_SCALARS)):  # result last
+    for field in ("vertices", "rigidity", *reversed(SCALARS)):  # result last
         values = [getattr(x, field) for x in full]
         if field == "result":
             values = [CODES.index(x) for x in values]
@@ -197,10 +201,9 @@ def write(root: Root, block: Block, done: Sequence[Done | str]) -> None:
 def errors_of(root: Root) -> dict[int, str]:
     """Return why jobs failed, by row."""
     found = {}
-    for mesh in range(int(root.attrs["meshes"])):
-        group = root[f"mesh_{mesh}"]
+    for group in groups(root):
         codes, each = group["result"][:], group["result"].chunks[0]
-        for number in sorted({k // each for k in np.flatnonzero(codes == CODES.index("failed"))}):
+        for number in sorted({k // each for k in np.flatnonzero(codes == FAILED)}):
             texts = json.loads(_text(group[f"errors_{number}"]))
             found |= {int(row): text for row, text in texts.items()}
     return found

@@ -24,11 +24,9 @@ class Count(NamedTuple):
 
 
 def count(root: Root, jobs: list[Job]) -> Count:
-    codes = np.concatenate(
-        [root[f"mesh_{k}"]["result"][:] for k in range(int(root.attrs["meshes"]))]
-    )
+    codes = np.concatenate([group["result"][:] for group in store.groups(root)])
     done = codes != store.WAITING
-    return Count(int(done.sum()), int((codes == store.CODES.index("failed")).sum()), len(jobs))
+    return Count(int(done.sum()), int((codes == store.FAILED).sum()), len(jobs))
 
 
 def table(root: Root, jobs: list[Job]) -> dict[str, list]:
@@ -39,11 +37,9 @@ def table(root: Root, jobs: list[Job]) -> dict[str, list]:
         for name in ("job", "mesh", "result", "energy", "misfit", "steps", "flipped", "seconds")
     }
     columns["error"] = [errors.get(row) for row in range(len(jobs))]
-    for k in range(int(root.attrs["meshes"])):
-        group = root[f"mesh_{k}"]
+    for group in store.groups(root):
         rows = group["row"][:]
-        scalars = {name: group[name][:].tolist() for name in ("energy", "misfit", "seconds")}
-        scalars |= {name: group[name][:].tolist() for name in ("steps", "flipped", "result")}
+        scalars = {name: group[name][:].tolist() for name in store.SCALARS}
         for place, row in enumerate(rows):
             code = scalars["result"][place]
             columns["job"][row], columns["mesh"][row] = jobs[row].job, Path(jobs[row].mesh).name
@@ -86,11 +82,10 @@ def write_table(run: str, columns: dict[str, list], as_csv: bool) -> list[str]:
 def export(root: Root, jobs: list[Job], folder: Path, suffix: str) -> int:
     """Write the mesh of each job that has one, and return how many."""
     format_of(Path(f"x{suffix}"))
-    codes, written = store.CODES, 0
-    for k in range(int(root.attrs["meshes"])):
-        group = root[f"mesh_{k}"]
+    written = 0
+    for group in store.groups(root):
         results, rows = group["result"][:], group["row"][:]
-        good = [p for p in range(len(rows)) if results[p] not in (-1, codes.index("failed"))]
+        good = [p for p in range(len(rows)) if results[p] not in (store.WAITING, store.FAILED)]
         if not good:
             continue
         mesh = jd.load_mesh(str(group.attrs["mesh"]))
