@@ -7,7 +7,7 @@ import pytest
 from helpers import EXACT, FD, THESIS
 
 import jaxdeform as jd
-from jaxdeform._estimation.deformed import deform_all
+from jaxdeform._estimation.deformed import State, deform_all
 from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
 from jaxdeform._estimation.poses import Poses
 
@@ -73,14 +73,15 @@ def test_handle_noise_against_the_dense_covariance():
     problem = jd.precompute(mesh, [0, 2, 6, 8])
     targets = np.asarray(jd.twist(mesh.vertices[problem.handles], 60.0, along="y"))
     free = np.asarray(problem.system.free)[None]
-    pose = np.asarray(jd.deform(problem, targets, 0.3).vertices)[None]
+    end = jd.deform(problem, targets, 0.3)
+    pose = np.asarray(end.vertices)[None]
     poses = Poses(targets[None], np.zeros((1, 9, 3)), free, pose)
-    field, solver = np.full(9, 0.3), jd.QuasiNewton()
+    ends, field, solver = [State(end.vertices, end.transforms)], np.full(9, 0.3), jd.QuasiNewton()
     dense = jax.jacrev(
         lambda t: jnp.where(free[0][:, None], jd.deform(problem, t, field).vertices, 0.0)
     )(jnp.asarray(targets))
     dense = np.asarray(dense).reshape(27, 12)
     for relative in (1.0, 0.5):
-        noise = find_handle_noise(problem, poses, field, solver, jd.Implicit(), relative)
+        noise = find_handle_noise(problem, poses, field, ends, solver, jd.Implicit(), relative)
         found = (noise.basis[0] * noise.size[0] ** 2) @ noise.basis[0].T
         np.testing.assert_allclose(found, relative**2 * dense @ dense.T, atol=1e-6)
