@@ -5,6 +5,7 @@ import numpy as np
 
 import jaxdeform as jd
 from jaxdeform._deformation.covariance import stiffness
+from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.cholesky import Factor, dense_inverse, factorise
 from jaxdeform._linalg.nested_dissection import dissected_factor
 
@@ -12,7 +13,9 @@ from jaxdeform._linalg.nested_dissection import dissected_factor
 def local_step_inputs(problem: jd.Problem, vertices: np.ndarray):
     """Return C (3, 3, vertices) at given positions, and the principal moments (3, vertices)."""
     system = problem.system
-    return system.covariance(jnp.asarray(vertices.T)), system.principal_moments
+    p = jnp.asarray(fill_up(vertices.T, problem.bucket))
+    c, moments = system.covariance(p), system.principal_moments
+    return c[..., : problem.n_vertices], moments[..., : problem.n_vertices]
 
 
 def global_matrix(mesh: jd.Mesh):

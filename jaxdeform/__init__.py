@@ -37,6 +37,7 @@ from jaxdeform._deformation.path import deform_path
 from jaxdeform._deformation.problem import Problem, precompute, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.solve import Solution, deform, energy
+from jaxdeform._deformation.stack import stack_problems
 from jaxdeform._errors import InputError
 from jaxdeform._estimation.discrepancy import Discrepancy
 from jaxdeform._estimation.field import FieldEstimate, estimate_rigidity_field
@@ -138,6 +139,7 @@ __all__ = [
     "shapes",
     "spokes",
     "sr_arap",
+    "stack_problems",
     "submesh",
     "translate",
     "twist",

@@ -267,8 +267,12 @@ def check_rigidity(
     *,
     name: str = "rigidity",
     unit: str = "vertex",
+    size: int | None = None,
 ) -> Float[Array, "vertices"] | Float[np.ndarray, "vertices"]:
-    """Return the rigidity as one number per vertex, or raise InputError naming what is wrong."""
+    """Return the rigidity as one number per vertex, or raise InputError naming what is wrong.
+
+    With a size, one number is spread over an array of that size.
+    """
     array = read_array(rigidity, dtype, name)
     if array.shape not in ((), (n,)):
         raise InputError(
@@ -282,4 +286,6 @@ def check_rigidity(
             raise InputError(
                 f"{name} is {values[bad[0]]}{where}: it must be a finite number, 0 or more"
             )
-    return (jnp if isinstance(array, Array) else np).broadcast_to(array, (n,))
+    if array.ndim:
+        return array
+    return (jnp if isinstance(array, Array) else np).broadcast_to(array, (size or n,))

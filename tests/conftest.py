@@ -1,5 +1,6 @@
 """Shared set-up: quick compilation, strict JAX, checked shapes, and the fixtures."""
 
+import importlib
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -46,6 +47,15 @@ def bar_problem(bar: jd.Mesh) -> jd.Problem:
 @pytest.fixture(scope="session")
 def bar_targets(bar: jd.Mesh, bar_problem: jd.Problem) -> np.ndarray:
     return np.asarray(jd.bend(bar.vertices[bar_problem.handles], 90.0))
+
+
+@pytest.fixture(scope="module")
+def exact_sizes():
+    """Let arrays be as long as the mesh, without what fills them up to their bucket."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_deformation.problem", "_deformation.system", "_baselines.laplacian_editing"):
+            patch.setattr(importlib.import_module(f"jaxdeform.{name}"), "bucket", lambda n: n)
+        yield
 
 
 @pytest.fixture

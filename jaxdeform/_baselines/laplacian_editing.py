@@ -1,57 +1,76 @@
 """Laplacian mesh editing, the baseline of Eq. 3.2."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._arrays import is_concrete
 from jaxdeform._checks import check_flag, check_precision, check_targets, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._handles.split import split_handles
+from jaxdeform._linalg.buckets import bucket, cut, fill_up
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
-from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._linalg.ell import WIDTHS, EllMatrix
 from jaxdeform._mesh.cells import spokes
 from jaxdeform._mesh.laplacian import normalised_laplacian
 from jaxdeform._mesh.mesh import Mesh
 
 
-class LaplacianEditor(eqx.Module):
-    """Laplacian editing, factored for one mesh and handle set; call it with targets (handles, 3).
+class _Equations(eqx.Module):
+    """The normal equations, filled up to the bucket of the mesh (buckets.py).
 
     Without similarities, the columns of the matrix are the vertices, and the rows of ``pull`` are
     three right-hand sides. With similarities, the columns are all coordinates, and there is one
     right-hand side.
+    """
+
+    free: Bool[Array, "columns"]
+    soft: Float[Array, "columns"]
+    """The weight of each soft handle, 0 elsewhere."""
+    pull: Float[Array, "rows columns"]
+    """L^T delta, the right-hand side of the details; zero where the matrix rotates the details."""
+    normal: EllMatrix
+    factor: Factor
+
+
+@jax.jit
+def _solve(equations: _Equations, led: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+    """Return the edited positions, given positions that have the handles on their targets."""
+    x = led.reshape(equations.pull.shape)
+    fixed = jnp.where(equations.free[None], 0.0, x)
+    right = equations.pull + equations.soft[None] * x - equations.normal.apply(fixed)
+    solution = equations.factor.solve(jnp.where(equations.free[None], right, 0.0))
+    return (fixed + solution).reshape(led.shape)
+
+
+class LaplacianEditor(eqx.Module):
+    """Laplacian editing, factored for one mesh and handle set; call it with targets (handles, 3).
 
     **Fields**
 
     - rest: (vertices, 3) rest positions.
     - handles: (handles,) indices of the handle vertices, in the order of the targets' rows.
-    - free: (columns,) True for each unknown.
-    - soft: (columns,) the weight of each soft handle; 0 elsewhere.
-    - pull: (rows, columns) L^T delta, the right-hand side of the details; zero where the matrix
-      rotates the details.
-    - normal: the matrix of the normal equations.
-    - factor: the factor of its free-free block.
+    - equations: the normal equations and their factor.
     """
 
     rest: Float[Array, "vertices 3"]
     handles: Int[np.ndarray | Array, "handles"]
-    free: Bool[Array, "columns"]
-    soft: Float[Array, "columns"]
-    pull: Float[Array, "rows columns"]
-    normal: EllMatrix
-    factor: Factor
+    equations: _Equations
 
     def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
         """Return the edited positions, differentiable in the targets (handles, 3)."""
         check_precision("this editor", np.dtype(self.rest.dtype))
-        targets = check_targets(targets, len(self.handles), self.rest.dtype)
-        x = self.rest.at[self.handles].set(targets).T.reshape(self.pull.shape)
-        fixed = jnp.where(self.free[None], 0.0, x)
-        right = self.pull + self.soft[None] * x - self.normal.apply(fixed)
-        solution = self.factor.solve(jnp.where(self.free[None], right, 0.0))
-        return (fixed + solution).reshape(3, -1).T
+        targets = check_targets(targets, len(self.handles), np.dtype(self.rest.dtype))
+        if all(map(is_concrete, (targets, self.rest, self.handles))):
+            led = np.array(self.rest)
+            led[np.asarray(self.handles)] = targets
+        else:
+            led = self.rest.at[self.handles].set(targets)
+        led = fill_up(led.T, self.equations.pull.size // 3)
+        return cut(_solve(self.equations, jnp.asarray(led)).T, len(self.rest), 0)
 
 
 def laplacian_editor(
@@ -108,8 +127,14 @@ def laplacian_editor(
     else:
         operator, positions = laplacian, mesh.vertices
         pull = (laplacian.T @ (laplacian @ mesh.vertices)).T
-    normal = (operator.T @ operator + sp.diags(soft)).tocsr()
-    dtype = np.dtype(jnp.result_type(float))
+    dtype, size = np.dtype(jnp.result_type(float)), bucket(n)
+    normal = _enlarged(operator.T @ operator + sp.diags(soft), n, size)
+
+    def filled_up(x: np.ndarray) -> np.ndarray:
+        """Fill up the vertices of each coordinate, or of all of them at once."""
+        return fill_up(x.reshape(*x.shape[:-1], -1, n), size).reshape(*x.shape[:-1], -1)
+
+    free, positions = filled_up(free), filled_up(positions.T).T
     try:
         factor = factorise(normal, free, dtype, positions=positions)
     except NotPositiveDefinite as error:
@@ -117,15 +142,23 @@ def laplacian_editor(
             "the handles do not determine the shape: give each connected component at least three "
             "vertices that are not on one line"
         ) from error
-    return LaplacianEditor(
-        rest=jnp.asarray(mesh.vertices, dtype),
-        handles=index,
-        free=jnp.asarray(free),
-        soft=jnp.asarray(soft, dtype),
-        pull=jnp.asarray(pull, dtype),
-        normal=EllMatrix.build([[normal]], dtype),
+    put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
+    equations = _Equations(
+        free=jax.device_put(free),
+        soft=put(filled_up(soft)),
+        pull=put(filled_up(pull)),
+        normal=EllMatrix.build([[normal]], dtype, WIDTHS[-1]),
         factor=factor,
     )
+    return LaplacianEditor(put(mesh.vertices), index, equations)
+
+
+def _enlarged(matrix: sp.spmatrix, n: int, size: int) -> sp.csr_matrix:
+    """Return a matrix of blocks (n, n) as one of blocks (size, size), with rows that are empty."""
+    given = sp.coo_matrix(matrix)
+    row, column = (x // n * size + x % n for x in (given.row, given.col))
+    width = matrix.shape[0] // n * size
+    return sp.csr_matrix((given.data, (row, column)), shape=(width, width))
 
 
 def laplacian_editing(

@@ -26,7 +26,8 @@ from jaxtyping import Array, Bool, Float
 from jaxdeform._deformation.cell_energy import cell_energies
 from jaxdeform._deformation.descent import Descent, Iterate
 from jaxdeform._deformation.local_step import RotationFit, solve_local_step
-from jaxdeform._deformation.problem import System
+from jaxdeform._deformation.system import System
+from jaxdeform._linalg.buckets import enlarge, fill_up
 from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._linalg.lbfgs import has_converged
@@ -64,10 +65,10 @@ class SmoothEnergy(NamedTuple):
         upper = sp.coo_matrix((b, (i, j)), (n, n))
         both = upper + upper.T
         row_sum = np.asarray(both.sum(axis=1)).ravel()
-        coupling = EllMatrix.build([[sp.csr_matrix(both + sp.diags(row_sum))]], dtype)
-        return SmoothEnergy(
-            system, coupling, jnp.asarray(row_sum, dtype), jnp.asarray(alpha, dtype)
-        )
+        size = system.rest.shape[-1]
+        coupling = EllMatrix.build([[enlarge(both + sp.diags(row_sum), size)]], dtype)
+        sums = jax.device_put(fill_up(row_sum, size).astype(dtype))
+        return SmoothEnergy(system, coupling, sums, jnp.asarray(alpha, dtype))
 
     def pull(self, t: Float[Array, "3 3 v"]) -> Float[Array, "3 3 v"]:
         """Return ``alpha sum_j b_ij (R_j + R_i)``: a symmetric and semidefinite map of R."""

@@ -12,10 +12,16 @@ from jaxdeform._baselines.smooth_rotations import (
     with_derivative_of_minimum,
 )
 from jaxdeform._checks import check_count, check_tolerance, check_type
-from jaxdeform._deformation.arguments import from_center, read_inputs
+from jaxdeform._deformation.arguments import from_center, read_inputs, read_shape
 from jaxdeform._deformation.problem import precompute
 from jaxdeform._deformation.reduced_energy import Inputs
-from jaxdeform._deformation.solve import Solution, guess, solution_of, without_derivative
+from jaxdeform._deformation.solve import (
+    Solution,
+    cut_to_mesh,
+    guess,
+    solution_of,
+    without_derivative,
+)
 from jaxdeform._errors import ArrayLike
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._mesh.cells import spokes
@@ -88,10 +94,10 @@ def sr_arap(
     relative = from_center(problem, "targets", targets, (len(problem.handles), 3), "handle")
     inputs = read_inputs(problem, relative, 0.0, None)
     if start is not None:
-        start = from_center(problem, "start", start, (problem.n_vertices, 3), "vertex")
+        start = read_shape(problem, "start", start)
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
     how = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
-    return _solve_at_once(energy, inputs, start, **how)
+    return cut_to_mesh(_solve_at_once(energy, inputs, start, **how), problem.n_vertices)
 
 
 def _solve(

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from jaxdeform._checks import check_count, check_flag, check_tolerance
 from jaxdeform._deformation.descent import Anchor, Descent, Solver
 from jaxdeform._deformation.metric import apply_metric, metric_of
-from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.system import System
 from jaxdeform._errors import InputError
 from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
 

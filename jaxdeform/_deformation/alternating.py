@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.adjoint import Unrolled
 from jaxdeform._deformation.descent import Descent, Iterate
-from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.system import System
 from jaxdeform._linalg.lbfgs import has_converged
 from jaxdeform._result import Result
 

@@ -20,6 +20,7 @@ from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.buckets import fill_up
 
 
 class Settings(NamedTuple):
@@ -52,11 +53,27 @@ def read_inputs(
     handle_weights: ArrayLike | None,
 ) -> Inputs:
     """Check the rigidity and the weights, and spread everything over all vertices."""
-    rigidity = check_rigidity(rigidity, problem.n_vertices, problem.dtype)
+    rigidity = read_rigidity(problem, rigidity)
     spread = spread_targets(problem, targets)
     soft = read_weights(problem, handle_weights)
     # NumPy's arrays are JAX's once they are inside.
     return Inputs(cast(Array, spread), cast(Array, rigidity), soft)
+
+
+def read_rigidity(
+    problem: Problem, rigidity: ArrayLike
+) -> Float[Array, "vertices"] | Float[np.ndarray, "vertices"]:
+    """Check the rigidity, and spread it over the arrays of the system."""
+    size = problem.bucket
+    return fill_up(check_rigidity(rigidity, problem.n_vertices, problem.dtype, size=size), size)
+
+
+def read_shape(
+    problem: Problem, name: str, vertices: ArrayLike
+) -> Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"]:
+    """Read positions of all vertices relative to the centre of the rest shape, and fill them up."""
+    given = from_center(problem, name, vertices, (problem.n_vertices, 3), "vertex")
+    return fill_up(given, problem.bucket)
 
 
 def from_center(
@@ -67,7 +84,7 @@ def from_center(
     Known values are subtracted in float64, so that a float32 problem far from the origin loses no
     digit of where its handles go.
     """
-    if isinstance(value, Array) and not is_concrete(value):
+    if problem.cells is None or (isinstance(value, Array) and not is_concrete(value)):
         given = read_positions(name, value, shape, problem.dtype, unit)
         center = problem.system.center.reshape((1,) * (len(shape) - 1) + (3,))
         return jnp.swapaxes(jnp.asarray(given - center), -1, -2)
@@ -89,7 +106,7 @@ def spread_targets(
     not compile anything anew.
     """
     system, handles = problem.system, problem.handles
-    shape = *targets.shape[:-1], problem.n_vertices
+    shape = *targets.shape[:-1], problem.bucket
     if all(map(is_concrete, (targets, system.rest, handles))):
         spread = np.array(np.broadcast_to(system.rest, shape))
         spread[..., np.asarray(handles)] = targets

@@ -15,10 +15,12 @@ from jaxdeform._checks import check_count, check_flag, check_function
 from jaxdeform._deformation.arguments import Settings, read_settings, read_weights
 from jaxdeform._deformation.descent import Solver
 from jaxdeform._deformation.local_step import LocalStep, Newton
-from jaxdeform._deformation.problem import Problem, System, check_problem
+from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs
-from jaxdeform._deformation.solve import Solution, solve
+from jaxdeform._deformation.solve import Solution, cut_to_mesh, solve
+from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.lbfgs import SLOTS
 from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
@@ -229,9 +231,9 @@ def _chunks(
         own = _everywhere(devices, PartitionSpec("batch"), own)
         waiting.append((first, _solve_chunk(system, soft, own, how, devices)))
         if len(waiting) == _IN_FLIGHT:
-            yield _finished(waiting.pop(0), batch.size)
+            yield _finished(waiting.pop(0), batch.size, problem.n_vertices)
     for chunk in waiting:
-        yield _finished(chunk, batch.size)
+        yield _finished(chunk, batch.size, problem.n_vertices)
 
 
 def _read_chunk(problem: Problem, batch: _Batch, members: slice) -> tuple:
@@ -243,13 +245,12 @@ def _read_chunk(problem: Problem, batch: _Batch, members: slice) -> tuple:
             return (batch.rows(name, members) - center).swapaxes(-1, -2).astype(dtype)
 
     count = members.stop - members.start
-    spread = np.array(
-        np.broadcast_to(np.asarray(problem.system.rest), (count, 3, problem.n_vertices))
-    )
+    size = problem.bucket
+    spread = np.array(np.broadcast_to(np.asarray(problem.system.rest), (count, 3, size)))
     spread[..., handles] = relative("targets")
     with np.errstate(over="ignore"):
-        rigidity = batch.rows("rigidity", members).astype(dtype)
-    return spread, rigidity, None if batch.start is None else relative("start")
+        rigidity = fill_up(batch.rows("rigidity", members).astype(dtype), size)
+    return spread, rigidity, None if batch.start is None else fill_up(relative("start"), size)
 
 
 def _everywhere(devices: jax.sharding.Mesh, spec: PartitionSpec, arrays: Any) -> Any:
@@ -282,7 +283,7 @@ def _solve_chunk(
     )(system, soft, own)
 
 
-def _finished(chunk: tuple[int, Solution], size: int) -> tuple[slice, Solution]:
+def _finished(chunk: tuple[int, Solution], size: int, count: int) -> tuple[slice, Solution]:
     """Wait for a chunk; cut off what only filled it up."""
     first, out = chunk
     if jax.process_count() > 1:
@@ -290,5 +291,5 @@ def _finished(chunk: tuple[int, Solution], size: int) -> tuple[slice, Solution]:
 
         out = jax.tree.map(partial(multihost_utils.process_allgather, tiled=True), out)
     last = min(first + len(out.steps), size)
-    out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), out)
-    return slice(first, last), jax.block_until_ready(settled(out))
+    out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), settled(out))
+    return slice(first, last), jax.block_until_ready(settled(cut_to_mesh(out, count)))

@@ -48,17 +48,21 @@ def covariance_map(
     vertices: Float[np.ndarray, "vertices 3"],
     principal_axes: Float[np.ndarray, "vertices 3 3"],
     dtype: np.dtype,
+    size: int | None = None,
 ) -> CovarianceMap:
-    """Return K for cells on these rest vertices, turned into their principal axes (columns)."""
-    edge = vertices[cells.edges[:, 0]] - vertices[cells.edges[:, 1]]
-    difference = difference_matrix(cells.edges, cells.n_vertices)
-    member = cells.membership.astype(np.float64)
-    in_world = [
-        (member @ sp.diags(cells.weights * edge[:, a]) @ difference).tocsr() for a in range(3)
-    ]
+    """Return K for cells on these rest vertices, turned into their principal axes (columns).
+
+    With a size, empty cells fill it up to so many (buckets.py).
+    """
+    size = size or cells.n_vertices
+    (i, j), member = cells.edges.T, cells.membership
+    pull = cells.weights[:, None] * (vertices[i] - vertices[j])
+    # For each edge of each cell, its two ends: +pull and -pull.
+    cell, edge = np.repeat(np.arange(cells.n_vertices), np.diff(member.indptr)), member.indices
+    share = np.einsum("eac,ea->ce", principal_axes[cell], pull[edge] * member.data[:, None])
+    rows, columns = np.tile(cell, 2), np.concatenate([i[edge], j[edge]])
     blocks = [
-        sp.csr_matrix(sum(sp.diags(principal_axes[:, a, c]) @ in_world[a] for a in range(3)))
-        for c in range(3)
+        sp.csr_matrix((np.concatenate([x, -x]), (rows, columns)), shape=(size, size)) for x in share
     ]
     return CovarianceMap(
         EllMatrix.build([[block] for block in blocks], dtype),

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._checks import check_setting
-from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.system import System
 from jaxdeform._result import Result
 
 

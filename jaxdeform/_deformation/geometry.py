@@ -15,8 +15,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._arrays import as_array, is_concrete
-from jaxdeform._deformation.problem import Problem, System
+from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._mesh.cells import Cells
 from jaxdeform._mesh.laplacian import cotangent_weights, opposite_edges
 
@@ -44,7 +46,7 @@ def read_geometry(
 
     They are given only to be differentiated in, so other values than the problem's are refused.
     """
-    cells, dtype = problem.cells, problem.dtype
+    cells, dtype = problem.own_cells, problem.dtype
     graph = _graph_of(cells, dtype)
     moved = problem.vertices if rest is None else rest
     moved = as_array(moved, dtype, "rest")
@@ -66,7 +68,8 @@ def read_geometry(
                     "are given to be differentiated in; call precompute for another rest shape"
                 )
     center = problem.system.center
-    return _geometry_of(graph, moved.T - center[:, None], weights, edge_weights is not None)
+    moved = jnp.asarray(fill_up(moved.T - center[:, None], problem.bucket))
+    return _geometry_of(graph, moved, weights, edge_weights is not None)
 
 
 def _graph_of(cells: Cells, dtype: np.dtype) -> Graph:

@@ -4,8 +4,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxdeform._linalg.buckets import enlarge
 from jaxdeform._linalg.cholesky import Factor, factorise
-from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._linalg.ell import WIDTHS, EllMatrix
 from jaxdeform._mesh.cells import Cells
 from jaxdeform._mesh.laplacian import normalised_laplacian
 
@@ -28,7 +29,12 @@ class LaplacianGuess(eqx.Module):
 def laplacian_guess(
     cells: Cells, free: Bool[np.ndarray, "vertices"], dtype: np.dtype
 ) -> LaplacianGuess:
-    """Set up the normal equations; a large factor is made when it is first used."""
+    """Set up the normal equations; a large factor is made when it is first used.
+
+    ``free`` may be longer than the mesh (buckets.py).
+    """
     laplacian = normalised_laplacian(cells.edges, cells.weights, cells.n_vertices)
-    normal = (laplacian.T @ laplacian).tocsr()
-    return LaplacianGuess(EllMatrix.build([[normal]], dtype), factorise(normal, free, dtype))
+    normal = enlarge(laplacian.T @ laplacian, len(free))
+    # One width for all meshes, since it is multiplied with once a deformation.
+    matrix = EllMatrix.build([[normal]], dtype, WIDTHS[-1])
+    return LaplacianGuess(matrix, factorise(normal, free, dtype))

@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdeform._checks import check_rigidity
 from jaxdeform._deformation.adjoint import Implicit
-from jaxdeform._deformation.arguments import spread_targets
+from jaxdeform._deformation.arguments import read_rigidity, spread_targets
 from jaxdeform._deformation.local_step import Newton
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._linalg.buckets import fill_up
 
 
 def minimum_near(
@@ -28,11 +28,11 @@ def minimum_near(
     system = problem.system
     center = system.center[:, None]
     relative = jnp.asarray(targets).T - center
-    known = jnp.asarray(check_rigidity(rigidity, problem.n_vertices, problem.dtype))
+    known = jnp.asarray(read_rigidity(problem, rigidity))
     inputs = Inputs(jnp.asarray(spread_targets(problem, relative)), known, system.soft)
     axes = system.principal_axes
-    t = jnp.einsum("kaj,jik->aik", transforms, axes, precision="highest")
-    p, _ = adjoint.minimum(
-        ReducedEnergy(Newton()), system, inputs, jnp.asarray(vertices).T - center, t
-    )
-    return (p + center).T
+    count, size = problem.n_vertices, problem.bucket
+    t = jnp.einsum("kaj,jik->aik", transforms, axes[..., :count], precision="highest")
+    p, t = fill_up(jnp.asarray(vertices).T - center, size), fill_up(t, size)
+    p, _ = adjoint.minimum(ReducedEnergy(Newton()), system, inputs, p, t)
+    return (p[:, :count] + center).T

@@ -34,7 +34,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxdeform._deformation.local_step import LocalStep
-from jaxdeform._deformation.problem import System
+from jaxdeform._deformation.system import System
 from jaxdeform._linalg.cholesky import HostCholesky
 from jaxdeform._linalg.ell import sparse_blocks
 from jaxdeform._linalg.factor_cache import (
@@ -142,7 +142,8 @@ def _key_on_host(out, *operands) -> None:
 
 def _is_soft(rigidity: np.ndarray, moments: np.ndarray) -> bool:
     area = np.maximum(moments.sum(axis=0), 0.0) / 2.0
-    return bool(np.mean(rigidity < _SOFT * area) >= _SOFT_PART)
+    cells = np.count_nonzero(area)  # without the empty ones
+    return bool(np.sum(rigidity < _SOFT * area) >= _SOFT_PART * max(cells, 1))
 
 
 def _rounded_up(rigidity: np.ndarray) -> np.ndarray:
@@ -216,9 +217,8 @@ def _compliance(moments: np.ndarray, rigidity: np.ndarray) -> np.ndarray:
 
 
 def _symmetric(lower: Matrix) -> sp.csc_matrix:
-    n = len(lower.free)
-    values = lower.values.reshape(-1).view(np.float64)
-    matrix = sp.csc_matrix((values, lower.rows, lower.starts), shape=(n, n))
+    n, (rows, values) = len(lower.free), lower.entries
+    matrix = sp.csc_matrix((values, rows, lower.starts), shape=(n, n))
     return matrix + sp.tril(matrix, -1).T
 
 

@@ -6,12 +6,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxdeform._deformation.arguments import from_center, read_inputs, read_settings
+from jaxdeform._deformation.arguments import (
+    from_center,
+    read_inputs,
+    read_settings,
+    read_shape,
+)
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.metric import apply_metric, metric_of
-from jaxdeform._deformation.problem import Problem, System, check_problem
+from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.saddles import lowest_curvature
+from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike
 
 # More steps of Lanczos than a descent takes at its end.
@@ -54,7 +60,7 @@ def is_minimum(
     energy = read_settings(local, None, None, False).energy
     moved = from_center(problem, "targets", targets, (len(problem.handles), 3), "handle")
     inputs = read_inputs(problem, moved, rigidity, handle_weights)
-    shape = from_center(problem, "vertices", vertices, (problem.n_vertices, 3), "vertex")
+    shape = read_shape(problem, "vertices", vertices)
     return _look(problem.system, inputs, jnp.asarray(shape), energy)
 
 

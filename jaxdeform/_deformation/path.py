@@ -10,12 +10,19 @@ from jaxtyping import Array, Float
 
 from jaxdeform._arrays import is_concrete, read_array, read_numbers
 from jaxdeform._checks import check_flag, check_function
-from jaxdeform._deformation.arguments import Settings, from_center, read_inputs, read_settings
+from jaxdeform._deformation.arguments import (
+    Settings,
+    from_center,
+    read_inputs,
+    read_settings,
+    read_shape,
+)
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.local_step import LocalStep, Newton
-from jaxdeform._deformation.problem import Problem, System, check_problem
+from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs
-from jaxdeform._deformation.solve import Solution, descend, guess, without_derivative
+from jaxdeform._deformation.solve import Solution, cut_to_mesh, descend, guess, without_derivative
+from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result
@@ -86,10 +93,8 @@ def deform_path(
     relative = _from_center(problem, targets)
     inputs = read_inputs(problem, relative, rigidity, handle_weights)
     system = problem.system
-    if start is None:
-        last = _Last.of(system.rest)
-    else:
-        last = _Last.of(from_center(problem, "start", start, (problem.n_vertices, 3), "vertex"))
+    shape = system.rest if start is None else read_shape(problem, "start", start)
+    last = _Last.of(shape)
     if progress is None:
         _, out = _follow(system, inputs, last, how)
     else:
@@ -99,6 +104,7 @@ def deform_path(
                 "grad): leave it out there"
             )
         out = _follow_slowly(system, inputs, last, how, progress)
+    out = cut_to_mesh(out, problem.n_vertices)
     return out.result.error_if(out, ~out.ok) if throw else out
 
 

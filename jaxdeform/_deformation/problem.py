@@ -9,21 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxdeform._checks import check_precision, check_rigidity, check_type
-from jaxdeform._deformation.covariance import CovarianceMap, covariance_map, stiffness
-from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
+from jaxdeform._deformation.covariance import stiffness
+from jaxdeform._deformation.system import System, build_system
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._handles.split import HandleSplit, split_handles
+from jaxdeform._linalg.buckets import bucket, cut, enlarge, fill_up
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
-from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.bounded import bounded_cells
-from jaxdeform._mesh.cells import Cells, principal_moments, rings
+from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform._mesh.normals import corner_sides
-from jaxdeform._mesh.polygons import from_triangles
 
 # Further from the origin, in diagonals, float32 keeps fewer than four digits of a position.
 _FAR_IN_FLOAT32 = 1e3
@@ -31,34 +29,8 @@ _FAR_IN_FLOAT32 = 1e3
 # of float32: of a bar of 1e-15 the energy was 2 % off, and of 1e-18 it was 300 times too large.
 _LARGEST_IN_FLOAT32 = 1e12
 
-
-class System(eqx.Module):
-    """All that the iterations read. Vertices are the last axis; they alone determine the shapes."""
-
-    rest: Float[Array, "3 vertices"]
-    """Rest positions, moved so that their centre is the origin."""
-    center: Float[Array, "3"]
-    free: Bool[Array, "vertices"]
-    soft: Float[Array, "vertices"]
-    """Weight of each soft handle, 0 elsewhere."""
-    principal_moments: Float[Array, "3 vertices"]
-    principal_axes: Float[Array, "3 3 vertices"]
-    """Columns are the axes: (world axis, principal axis, cell)."""
-    covariance: CovarianceMap
-    stiffness: EllMatrix
-    """A, with the weights of the soft handles on its diagonal."""
-    factor: Factor
-    initial_guess: LaplacianGuess
-    faces: Int[Array, "faces 3"]
-    sides: Float[Array, "faces 3"] | None
-    """-1 where a face is turned over as seen from a corner; None stands for 1 everywhere."""
-
-    def held(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
-        """Return x at the vertices that are not free, 0 elsewhere.
-
-        Added to a Hessian, which is 0 there, it makes the system regular.
-        """
-        return jnp.where(self.free[None], 0.0, x)
+# Faces for each vertex: closed meshes have just below 2.
+_FACES = (2.05,)
 
 
 class Problem(eqx.Module):
@@ -72,22 +44,35 @@ class Problem(eqx.Module):
 
     - system: the arrays that the iterations read.
     - handles: (handles,) indices of the handle vertices, in the order of the targets' rows.
-    - cells: the cells (`rings` with r = 1 by default), with the weights that are computed with.
+    - cells: the cells (`rings` with r = 1 by default), with the weights that are computed with;
+      None in a stack of problems (`stack_problems`).
     """
 
     system: System
-    handles: Int[np.ndarray | Array, "handles"]
-    cells: Cells = eqx.field(static=True)
+    handles: Int[np.ndarray | Array, "*stack handles"]
+    cells: Cells | None = eqx.field(static=True)
 
     @property
     def mesh(self) -> Mesh:
-        """The rest shape."""
-        return self.cells.mesh
+        """The rest shape. **Raises** InputError for a stack, which has many."""
+        return self.own_cells.mesh
+
+    @property
+    def own_cells(self) -> Cells:
+        """The cells. **Raises** InputError for a stack, which has those of many meshes."""
+        if self.cells is None:
+            raise InputError("a stack of problems has no mesh of its own: ask the problems in it")
+        return self.cells
 
     @property
     def n_vertices(self) -> int:
-        """Number of vertices."""
-        return self.mesh.n_vertices
+        """Number of vertices; of a stack, the number that its arrays have."""
+        return self.bucket if self.cells is None else self.cells.n_vertices
+
+    @property
+    def bucket(self) -> int:
+        """Number of vertices of the arrays in ``system``; those beyond ``n_vertices`` are empty."""
+        return self.system.rest.shape[-1]
 
     @property
     def vertices(self) -> Float[np.ndarray, "vertices 3"]:
@@ -101,6 +86,8 @@ class Problem(eqx.Module):
 
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
+        if self.system.rest.ndim > 2:
+            return f"Problem({len(self.handles)} stacked, {self.bucket} vertices, {self.dtype})"
         return f"Problem({self.n_vertices} vertices, {len(self.handles)} handles, {self.dtype})"
 
 
@@ -169,24 +156,7 @@ def precompute(
             "float32; give it in another unit of length, or use float64"
         )
     used, matrix, factor = _factorise(cells, rest, split, dtype)
-    moments, axes = principal_moments(used)
-    sides = corner_sides(from_triangles(mesh.faces))
-    put = lambda x: jax.device_put(np.asarray(x, dtype))  # noqa: E731 (compiles nothing)
-    system = System(
-        rest=put(rest.T),
-        center=put(center),
-        free=jax.device_put(split.free),
-        soft=put(split.soft),
-        principal_moments=put(moments.T),
-        principal_axes=put(axes.transpose(1, 2, 0)),
-        covariance=covariance_map(used, rest, axes, dtype),
-        stiffness=EllMatrix.build([[sp.csr_matrix(matrix)]], dtype),
-        factor=factor,
-        initial_guess=laplacian_guess(used, split.free & (split.soft == 0), dtype),
-        faces=jax.device_put(mesh.faces.astype(np.int32)),
-        sides=None if sides is None else put(sides.reshape(-1, 3)),
-    )
-    return Problem(system, split.index, used)
+    return Problem(build_system(used, rest, split, matrix, factor, dtype), split.index, used)
 
 
 def _checked_dtype(dtype: Any) -> np.dtype:
@@ -205,8 +175,11 @@ def _checked_dtype(dtype: Any) -> np.dtype:
 
 def _factorise(
     cells: Cells, rest: Float[np.ndarray, "vertices 3"], split: HandleSplit, dtype: np.dtype
-) -> tuple[Cells, sp.spmatrix, Factor]:
-    """Factor A of cells whose energy has a lower bound, and return those cells."""
+) -> tuple[Cells, sp.csr_matrix, Factor]:
+    """Factor A of cells whose energy has a lower bound, and return those cells and A."""
+    size = bucket(cells.n_vertices)
+    free = fill_up(split.free, size)
+    positions = fill_up(rest.T, size).T
     used, bad = bounded_cells(cells)
     if bad.size:
         shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
@@ -217,17 +190,17 @@ def _factorise(
             "otherwise.",
             stacklevel=3,
         )
-    matrix = stiffness(used) + sp.diags(split.soft)
+    matrix = enlarge(stiffness(used) + sp.diags(split.soft), size)
     try:
-        return used, matrix, factorise(matrix, split.free, dtype, positions=rest)
+        return used, matrix, factorise(matrix, free, dtype, positions=positions)
     except NotPositiveDefinite:
         pass
     lifted = lifted_weights(used.weights)
     raised = int((lifted > used.weights).sum())
     used = dataclasses.replace(used, weights=lifted)
-    matrix = stiffness(used) + sp.diags(split.soft)
+    matrix = enlarge(stiffness(used) + sp.diags(split.soft), size)
     try:
-        factor = factorise(matrix, split.free, dtype, positions=rest)
+        factor = factorise(matrix, free, dtype, positions=positions)
     except NotPositiveDefinite as error:
         raise InputError(
             "the system of the free vertices is singular even with positive weights: the mesh "
@@ -245,6 +218,11 @@ def check_problem(problem: Any) -> None:
     """Raise InputError unless this is a problem, of a type that JAX can compute in now."""
     check_type("problem", problem, Problem)
     check_precision("problem", problem.dtype)
+    if problem.system.rest.ndim > 2:
+        raise InputError(
+            "problem: a stack of problems, which jax.vmap takes apart: call "
+            "jax.vmap(lambda problem, targets: jd.deform(problem, targets, ...))(stack, targets)"
+        )
 
 
 def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:
@@ -265,6 +243,10 @@ def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array
         (722,)
     """
     check_problem(problem)
-    constant = check_rigidity(constant, problem.n_vertices, problem.dtype, name="constant")
+    size = problem.bucket
+    constant = check_rigidity(
+        constant, problem.n_vertices, problem.dtype, name="constant", size=size
+    )
+    constant = jnp.asarray(fill_up(constant, size))
     trace = jnp.sum(problem.system.principal_moments, axis=0)
-    return jnp.asarray(constant) * jnp.maximum(trace, 0.0) / 2.0
+    return cut(constant * jnp.maximum(trace, 0.0) / 2.0, problem.n_vertices)

@@ -12,9 +12,9 @@ from jaxdeform._checks import check_choice, check_count, check_flag, check_toler
 from jaxdeform._deformation.adjoint import Implicit
 from jaxdeform._deformation.descent import Descent
 from jaxdeform._deformation.metric import Choice, apply_metric, metric_of
-from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.saddles import leave_saddles, lowest_curvature
+from jaxdeform._deformation.system import System
 from jaxdeform._linalg.lbfgs import Function, Settings, minimize
 from jaxdeform._result import Result
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxdeform._deformation.geometry import Geometry, GeometryMaps
 from jaxdeform._deformation.local_step import LocalStep, solve_local_step
-from jaxdeform._deformation.problem import System
+from jaxdeform._deformation.system import System
 from jaxdeform._linalg.ell import split_batch
 from jaxdeform._linalg.lbfgs import Sample
 from jaxdeform._linalg.xla import total
@@ -130,9 +130,11 @@ def _felt(rigidity: Float[Array, "v"], moments: Float[Array, "3 v"]) -> Float[Ar
     The strain is known to eps, so its energy to lambda eps^2, which must stay below what B weighs.
     A cell of lambda = B / (100 eps) is rigid to 100 eps. Without the bound a float32 sheet of
     rigidity 1e12 was 15 % of its length off, and 'Converged'.
+
+    An empty cell is rigid: any T would do for a rigidity of 0.
     """
     most = jnp.max(jnp.abs(moments), axis=0) / (100.0 * jnp.finfo(moments.dtype).eps)
-    return jnp.where(most > 0, jnp.minimum(rigidity, most), rigidity)
+    return jnp.where(most > 0, jnp.minimum(rigidity, most), 1.0)
 
 
 def vertex_normals(

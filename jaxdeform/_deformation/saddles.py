@@ -18,9 +18,9 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._deformation.metric import Metric, apply_metric
-from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform._linalg.batching import spread_over_members
+from jaxdeform._deformation.system import System
+from jaxdeform._linalg.batching import is_shared, one_by_one, spread_over_members
 from jaxdeform._linalg.lanczos import lowest_mode
 from jaxdeform._linalg.lbfgs import Minimum, Settings
 
@@ -61,7 +61,9 @@ def lowest_curvature(
 
     @look.def_vmap
     def look_at_some(size, is_batched, system, own):
-        own = spread_over_members(size, is_batched[0], is_batched[1], own)
+        if not is_shared(is_batched[0]):
+            return one_by_one(look, size, is_batched, (system, own))
+        own = spread_over_members(size, is_batched[1], own)
         each = partial(look.fun, system)
         return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE)), (True, True)
 

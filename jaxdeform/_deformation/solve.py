@@ -1,5 +1,6 @@
 """Deforming a mesh: the public function, and the solution that it returns."""
 
+import dataclasses
 from functools import partial
 
 import equinox as eqx
@@ -9,16 +10,26 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._checks import check_flag, check_positions, check_rigidity
-from jaxdeform._deformation.arguments import Settings, from_center, read_inputs, read_settings
+from jaxdeform._arrays import is_concrete
+from jaxdeform._checks import check_flag, check_rigidity, read_positions
+from jaxdeform._deformation.arguments import (
+    Settings,
+    from_center,
+    read_inputs,
+    read_settings,
+    read_shape,
+)
 from jaxdeform._deformation.cell_energy import cell_energies
 from jaxdeform._deformation.descent import Adjoint, Anchor, Descent, Solver
 from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
-from jaxdeform._deformation.problem import Problem, System, check_problem
+from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.system import System
 from jaxdeform._deformation.verdict import inside_out, verdict
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.buckets import cut, fill_up
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, succeeded
 
@@ -139,7 +150,7 @@ def deform(
     relative = from_center(problem, "targets", targets, (rows, 3), "handle")
     inputs = read_inputs(problem, relative, rigidity, handle_weights)
     if start is not None:
-        start = from_center(problem, "start", start, (problem.n_vertices, 3), "vertex")
+        start = read_shape(problem, "start", start)
     if rest is not None or edge_weights is not None:
         inputs = inputs._replace(geometry=read_geometry(problem, rest, edge_weights))
         if not how.adjoint.needs_one_energy:
@@ -147,8 +158,15 @@ def deform(
                 "rest and edge_weights are differentiated by Implicit() only: give "
                 "adjoint=jd.Implicit()"
             )
-    out = _solve_at_once(problem.system, inputs, start, how)
+    out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, how), problem.n_vertices)
     return out.result.error_if(out, ~out.ok) if throw else out
+
+
+def cut_to_mesh(out: Solution, count: int) -> Solution:
+    """Leave out what fills up the arrays of a solution, and wait for it where Ctrl-C is heard."""
+    out = settled(out)
+    vertices, transforms = cut(out.vertices, count, -2), cut(out.transforms, count, -3)
+    return dataclasses.replace(out, vertices=vertices, transforms=transforms)
 
 
 def energy(
@@ -168,11 +186,25 @@ def energy(
         True
     """
     check_problem(problem)
-    count, dtype, system = problem.n_vertices, problem.dtype, problem.system
-    p = check_positions("vertices", vertices, (count, 3), dtype).T - system.center[:, None]
-    t = check_positions("transforms", transforms, (count, 3, 3), dtype)
-    lam = jnp.asarray(check_rigidity(rigidity, count, dtype))
-    t = jnp.einsum("kai,ijk->ajk", t, system.principal_axes, precision="highest")
+    system = problem.system
+    p = jnp.asarray(read_shape(problem, "vertices", vertices))
+    shape = problem.n_vertices, 3, 3
+    t = read_positions("transforms", transforms, shape, problem.dtype)
+    t = np.asarray(t) if is_concrete(t) else t
+    t = fill_up(t.transpose(1, 2, 0), problem.bucket)
+    # Without rigidity, so that T = 0 of what fills up costs nothing.
+    lam = fill_up(check_rigidity(rigidity, problem.n_vertices, problem.dtype), problem.bucket)
+    return _energy(system, p, jnp.asarray(t), jnp.asarray(lam))
+
+
+@jax.jit
+def _energy(
+    system: System,
+    p: Float[Array, "3 vertices"],
+    t: Float[Array, "3 3 vertices"],
+    lam: Float[Array, "vertices"],
+) -> Float[Array, ""]:
+    t = jnp.einsum("aik,ijk->ajk", t, system.principal_axes, precision="highest")
     stiff = system.stiffness.apply(p) - system.soft[None] * p
     cells = cell_energies(t, system.covariance(p), system.principal_moments, lam)
     return jnp.sum(p * stiff) + jnp.sum(cells)

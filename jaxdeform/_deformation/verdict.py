@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxdeform._deformation.descent import Descent
-from jaxdeform._deformation.problem import System
 from jaxdeform._deformation.reduced_energy import Inputs
+from jaxdeform._deformation.system import System
 from jaxdeform._result import Result
 
 # A vertex further than this many diagonals from the box of the mesh and its targets is no answer.

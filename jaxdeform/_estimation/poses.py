@@ -67,7 +67,7 @@ def check_poses(problem: Any, observed: Any, targets: Any, mask: Any) -> Poses:
             f"({len(bad)} such): mark what was not seen with mask"
         )
     goal = _check_targets(problem, targets, given, seen)
-    free = np.asarray(problem.system.free)
+    free = np.asarray(problem.system.free)[: problem.n_vertices]
     counted = seen & free
     if not counted.any():
         move = "observe one that is free (mask)" if free.any() else "leave some out of the handles"

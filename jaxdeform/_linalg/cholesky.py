@@ -101,7 +101,7 @@ def factorise(
             return dissected_factor(matrix, free, positions, dtype)
         except np.linalg.LinAlgError as error:
             raise NotPositiveDefinite(str(error)) from error
-    content = Matrix.of(matrix, free)
+    content = Matrix.of(matrix, free).filled_up(first=not exact)
     key = content.key()
     if exact:
         factors.get(key, content, dtype, shifts)

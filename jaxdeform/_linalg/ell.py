@@ -23,6 +23,9 @@ processor time is the same: K 4.2 and 4.3 ms, K^T 4.4 and 4.5 ms, a Hessian prod
 12.9 ms, four of them under vmap 34.8 and 33.8 ms (50,298 vertices, 2 cores, a loaded machine).
 """
 
+import math
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,8 +34,15 @@ import scipy.sparse as sp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-WIDEST = 24
-"""A row with more entries goes on in overflow rows: one pole of valence 40 must not widen all."""
+from jaxdeform._linalg.buckets import next_of
+
+WIDTHS = (8, 12, 16, 20, 24)
+"""Slots of a row. One with more entries goes on in overflow rows of half as many slots: a pole of
+valence 40 must not widen all."""
+# Overflow rows for each row: always some, so that meshes with and without poles share the code.
+_PARTS = (0.125,)
+# An overflow row is added by scatter, which costs about so many slots.
+_SCATTER = 24
 
 
 class EllMatrix(eqx.Module):
@@ -45,36 +55,45 @@ class EllMatrix(eqx.Module):
 
     columns: Int[Array, "slots vertices"]
     values: Float[Array, "out in slots vertices"]
-    overflow_columns: Int[Array, "slots overflow"]
-    overflow_values: Float[Array, "out in slots overflow"]
+    overflow_columns: Int[Array, "narrow overflow"]
+    overflow_values: Float[Array, "out in narrow overflow"]
     overflow_rows: Int[Array, "overflow"]
     """Rows that the overflow rows continue."""
 
     @staticmethod
-    def build(blocks: list[list[sp.csr_matrix]], dtype: np.dtype) -> "EllMatrix":
-        """Pack a grid of blocks (vertices, vertices); the width is the one that stores least."""
-        pattern = sp.csr_matrix(sum(abs(block) for row in blocks for block in row))
-        pattern.sort_indices()
+    def build(
+        blocks: list[list[sp.csr_matrix]], dtype: np.dtype, width: int | None = None
+    ) -> "EllMatrix":
+        """Pack a grid of blocks (vertices, vertices).
+
+        The numbers of slots and of overflow rows are of a short series, so that meshes of one
+        bucket (buckets.py) share the compiled code. By default they are those that cost least.
+        """
+        pattern, entries = _with_one_pattern(blocks)
         length = np.diff(pattern.indptr)
         n = len(length)
-        width = _best_width(length)
+        shape = _cheapest(length) if width is None else _Shape.of(length, width)
         row = np.repeat(np.arange(n), length)
         position = np.arange(pattern.nnz) - np.repeat(pattern.indptr[:-1], length)
-        overflows = np.maximum(-(-length // width) - 1, 0)
-        first = n + np.r_[0, np.cumsum(overflows)[:-1]]
-        stored_row = np.where(position < width, row, first[row] + position // width - 1)
-        slot = position % width
-        total = n + int(overflows.sum())
-        columns = np.zeros((width, total), np.int32)
-        columns[slot, stored_row] = pattern.indices
-        values = np.zeros((len(blocks), len(blocks[0]), width, total), dtype)
-        for i, j in np.ndindex(values.shape[:2]):
-            values[i, j, slot, stored_row] = np.asarray(blocks[i][j][row, pattern.indices]).ravel()
-        overflow_rows = np.repeat(np.arange(n), overflows).astype(np.int32)
-        return EllMatrix(
-            *map(jnp.asarray, (columns[:, :n], values[..., :n])),
-            *map(jnp.asarray, (columns[:, n:], values[..., n:], overflow_rows)),
-        )
+        more = position - shape.width
+        overflows = shape.overflows(length)
+        first = np.r_[0, np.cumsum(overflows)[:-1]]
+
+        def packed(chosen, slot, at, slots: int, count: int, rest):
+            # Empty slots read the row's own vertex: what is near stays near.
+            columns = np.broadcast_to(rest, (slots, count)).astype(np.int32)
+            columns[slot, at] = pattern.indices[chosen]
+            values = np.zeros((*entries.shape[:2], slots, count), dtype)
+            values[..., slot, at] = entries[..., chosen]
+            return columns, values
+
+        inside, outside = np.flatnonzero(more < 0), np.flatnonzero(more >= 0)
+        main = packed(inside, position[inside], row[inside], shape.width, n, np.arange(n))
+        slot, at = more[outside] % shape.narrow, first[row[outside]] + more[outside] // shape.narrow
+        overflow_rows = np.zeros(shape.rows, np.int32)
+        overflow_rows[: overflows.sum()] = np.repeat(np.arange(n), overflows)
+        rest = packed(outside, slot, at, shape.narrow, shape.rows, overflow_rows)
+        return EllMatrix(*jax.device_put((*main, *rest, overflow_rows)))
 
     def apply(self, x: Float[Array, "*lead v"], batch: int = 1) -> Float[Array, "*lead v"]:
         """Return the product with x, for a matrix of one block that is symmetric."""
@@ -85,8 +104,8 @@ class EllMatrix(eqx.Module):
 def sparse_blocks(
     columns: Int[np.ndarray, "slots vertices"],
     values: Float[np.ndarray, "out 1 slots vertices"],
-    overflow_columns: Int[np.ndarray, "slots overflow"],
-    overflow_values: Float[np.ndarray, "out 1 slots overflow"],
+    overflow_columns: Int[np.ndarray, "narrow overflow"],
+    overflow_values: Float[np.ndarray, "out 1 narrow overflow"],
     overflow_rows: Int[np.ndarray, "overflow"],
 ) -> list[sp.csr_matrix]:
     """Return the blocks of a matrix of one column of blocks, given its arrays in their order."""
@@ -102,12 +121,46 @@ def sparse_blocks(
     return out
 
 
-def _best_width(length: Int[np.ndarray, "vertices"]) -> int:
-    """Return the number of slots that stores least; length counts the entries of each row."""
-    widths = np.arange(1, min(WIDEST, max(1, length.max(initial=1))) + 1)
-    # An overflow row is added by scatter, which costs about four plain rows.
-    sizes = [w * (len(length) + 4 * np.ceil(np.maximum(length - w, 0) / w).sum()) for w in widths]
-    return int(widths[np.argmin(sizes)])
+def _with_one_pattern(
+    blocks: list[list[sp.csr_matrix]],
+) -> tuple[sp.csr_matrix, Float[np.ndarray, "out in entries"]]:
+    """Return a pattern that holds the entries of all blocks, and their values at its entries."""
+    pattern, *others = [block for row in blocks for block in row]
+    same = all(np.array_equal(x.indices, pattern.indices) for x in others)
+    if not same or not pattern.has_sorted_indices:
+        pattern = sp.csr_matrix(sum(abs(block) for row in blocks for block in row))
+        pattern.sort_indices()
+        length = np.diff(pattern.indptr)
+        row = np.repeat(np.arange(len(length)), length)
+        values = [[np.ravel(x[row, pattern.indices]) for x in line] for line in blocks]
+        return pattern, np.array(values)
+    return pattern, np.array([[block.data for block in line] for line in blocks])
+
+
+class _Shape(NamedTuple):
+    """The number of slots of a row and of an overflow row, and the number of overflow rows."""
+
+    width: int
+    narrow: int
+    rows: int
+
+    @staticmethod
+    def of(length: Int[np.ndarray, "vertices"], width: int) -> "_Shape":
+        shape = _Shape(width, max(width // 2, 1), 0)
+        n = max(len(length), 1)
+        part = next_of(_PARTS, shape.overflows(length).sum() / n)
+        return shape._replace(rows=math.ceil(part * len(length)))
+
+    def overflows(self, length: Int[np.ndarray, "vertices"]) -> Int[np.ndarray, "vertices"]:
+        """Return the number of overflow rows of each row."""
+        return -(-np.maximum(length - self.width, 0) // self.narrow)
+
+
+def _cheapest(length: Int[np.ndarray, "vertices"]) -> _Shape:
+    """Return the shape that costs least; length counts the entries of each row."""
+    shapes = [_Shape.of(length, width) for width in WIDTHS]
+    cost = [x.width * len(length) + (x.narrow + _SCATTER) * x.rows for x in shapes]
+    return shapes[int(np.argmin(cost))]
 
 
 def split_batch(x: Float[Array, "*lead v"], batch: int) -> Float[Array, "*lead vertices batch"]:

@@ -6,6 +6,7 @@ JAXDEFORM_FACTOR_BYTES. A factor that had to go is made again when it is needed.
 
 import atexit
 import hashlib
+import math
 import os
 import threading
 import weakref
@@ -17,11 +18,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from cholespy import CholeskySolverD, CholeskySolverF, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
-from jaxtyping import Array, Bool, Int32, UInt32
+from jaxtyping import Array, Bool, Float, Int32, UInt32
+
+from jaxdeform._linalg.buckets import fill_up, next_of
 
 # The diagonal of a matrix that only gives a first guess is raised by these parts of itself, one
 # after another, until there is a factor: rounding makes L^T L indefinite where triangles are flat.
 SHIFTS = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)
+
+# Entries of the lower triangle for each unknown: closed meshes have just below 4, their L^T L 7 to
+# 11.
+_ENTRIES = (4.25, 12.0, 16.0, 24.0)
 
 # What all factors of a process may take together. The one made last stays in any case.
 CAPACITY = int(os.environ.get("JAXDEFORM_FACTOR_BYTES", 2 << 30))
@@ -76,18 +83,33 @@ class Matrix(NamedTuple):
         pairs = list(zip(self, other, strict=True))
         return all(a.shape == b.shape for a, b in pairs) and all((a == b).all() for a, b in pairs)
 
+    def filled_up(self, first: bool) -> "Matrix":
+        """Return the matrix with room for the entries of every mesh of its bucket (buckets.py).
+
+        ``first``: it is for a first guess, and so L^T L.
+        """
+        n, count = len(self.free), len(self.rows)
+        size = math.ceil(next_of(_ENTRIES[first:], count / max(n, 1)) * n)
+        rows, values = fill_up(self.rows, size), fill_up(self.values.T, size).T
+        return self._replace(rows=rows, values=np.ascontiguousarray(values))
+
+    @property
+    def entries(self) -> tuple[Int32[np.ndarray, "entries"], Float[np.ndarray, "entries"]]:
+        """The rows and the values, without what fills them up."""
+        count = self.starts[-1]
+        return self.rows[:count], self.values.reshape(-1).view(np.float64)[:count]
+
     def inner(self) -> sp.csc_matrix:
         """Return the lower triangle, with the rows and columns of fixed unknowns the identity's.
 
         So nobody has to pick the free entries of a right-hand side, and the factor is no larger.
         """
-        n = len(self.free)
+        n, (rows, values) = len(self.free), self.entries
         columns = np.repeat(np.arange(n, dtype=np.int32), np.diff(self.starts))
-        on_diagonal = columns == self.rows
-        free = self.free[columns] & self.free[self.rows]
-        values = np.where(free, self.values.reshape(-1).view(np.float64), 1.0)
-        kept = on_diagonal | free
-        return sp.csc_matrix((values[kept], (self.rows[kept], columns[kept])), shape=(n, n))
+        free = self.free[columns] & self.free[rows]
+        kept = (columns == rows) | free
+        values = np.where(free, values, 1.0)[kept]
+        return sp.csc_matrix((values, (rows[kept], columns[kept])), shape=(n, n))
 
 
 def cholesky(lower: sp.csc_matrix, dtype: np.dtype, shifts: tuple[float, ...]) -> Any:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._linalg.batching import spread_over_members
+from jaxdeform._linalg.batching import is_shared, one_by_one, spread_over_members
 from jaxdeform._linalg.cholesky import has_accelerator
 from jaxdeform._linalg.xla import after_reads, without_fusion
 
@@ -114,7 +114,9 @@ def minimize(
 
     @batch.def_vmap
     def larger_batch(size, is_batched, system, *own):
-        own = spread_over_members(size, is_batched[0], tuple(is_batched[1:]), own)
+        if not is_shared(is_batched[0]):
+            return one_by_one(batch, size, is_batched, (system, *own))
+        own = spread_over_members(size, tuple(is_batched[1:]), own)
         each = own[-1].shape[1]
         flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
         out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), batch(system, *flat))

@@ -11,6 +11,8 @@ from small_meshes import MESHES, brute_cells, random_case
 import jaxdeform as jd
 from jaxdeform._deformation.covariance import stiffness
 
+pytestmark = pytest.mark.usefixtures("exact_sizes")
+
 
 @pytest.fixture(params=MESHES)
 def case(request):

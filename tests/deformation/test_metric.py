@@ -15,7 +15,7 @@ def slow(kind: str):
 
 
 @pytest.fixture(scope="module")
-def small():
+def small(exact_sizes):
     """A bumpy sheet of 16 vertices, held at one end."""
     mesh = _sheet()
     return jd.precompute(mesh, np.flatnonzero(mesh.vertices[:, 1] < 0.1))

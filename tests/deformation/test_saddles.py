@@ -9,6 +9,7 @@ import pytest
 import jaxdeform as jd
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.saddles import lowest_curvature
+from jaxdeform._linalg.buckets import fill_up
 
 STAY = jd.QuasiNewton(leave_saddles=False)
 
@@ -25,8 +26,9 @@ def test_the_curvature_is_that_of_the_energy(bar, bar_problem, pushed):
     out = jd.deform(bar_problem, pushed, 30.0, solver=STAY)
     system = bar_problem.system
     energy = ReducedEnergy(jd.Newton())
-    p = (out.vertices - system.center[None]).T
-    inputs = Inputs(p, jnp.full(722, 30.0), system.soft)
+    size = bar_problem.bucket
+    p = jnp.asarray(fill_up((out.vertices - system.center[None]).T, size))
+    inputs = Inputs(p, jnp.full(size, 30.0), system.soft)
     t = energy.evaluate(system, inputs, p).transforms
     value, x = lowest_curvature(energy, system, inputs, None, p, t)
     at = lambda s: float(energy.evaluate(system, inputs, p + s * x).energy)  # noqa: E731

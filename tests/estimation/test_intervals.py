@@ -40,7 +40,7 @@ def problem() -> jd.Problem:
 def linear_model(problem, influence) -> LinearModel:
     """Return a model with so much influence of each of two parts, and noise of size 0.01."""
     draw = np.random.default_rng(0)
-    free = np.broadcast_to(np.asarray(problem.system.free), (POSES, 9))
+    free = np.broadcast_to(np.asarray(problem.system.free)[:9], (POSES, 9))
     slopes = draw.standard_normal((POSES, 9, 3, 2)) * influence
     observed = slopes @ np.zeros(2) + 0.01 * draw.standard_normal((POSES, 9, 3))
     observed = np.where(free[..., None], observed, 0.0)

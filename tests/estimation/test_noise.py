@@ -72,7 +72,7 @@ def test_handle_noise_against_the_dense_covariance():
     mesh = jd.shapes.square()
     problem = jd.precompute(mesh, [0, 2, 6, 8])
     targets = np.asarray(jd.twist(mesh.vertices[problem.handles], 60.0, along="y"))
-    free = np.asarray(problem.system.free)[None]
+    free = np.asarray(problem.system.free)[None, : problem.n_vertices]
     end = jd.deform(problem, targets, 0.3)
     pose = np.asarray(end.vertices)[None]
     poses = Poses(targets[None], np.zeros((1, 9, 3)), free, pose)
