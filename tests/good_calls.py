@@ -319,5 +319,5 @@ KINDS_HERE = {
 
 
 def kind_of(function: str, argument: str) -> str:
-    """Return the kind of an argument: a key of the table in test_arguments.py."""
+    """Return the kind of an argument: a key of the table in wrong_values.py."""
     return KINDS_HERE.get((function, argument)) or KINDS.get(argument, argument)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -14,26 +13,20 @@ from typer.core import TyperCommand
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import MEDIUM, Material, read_material
+from jaxdeform._apps.methods import Method, Way
 from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
 from jaxdeform._apps.output import Output
 from jaxdeform._apps.talk import console, counted, patiently, since
-
-
-class Method(StrEnum):
-    """The methods, by their names on the command line."""
-
-    material = "material"
-    arap = "arap"
-    rc_arap = "rc-arap"
-    laplacian = "laplacian"
-
+from jaxdeform._checks import check_tolerance
 
 # Options that a method does not read.
+_RIGIDITY = "--rigidity", "--stiff"
 _UNREAD = {
-    Method.material: (),
-    Method.arap: ("--rings", "--rigidity", "--stiff"),
-    Method.rc_arap: ("--rigidity", "--stiff"),
-    Method.laplacian: ("--rings", "--rigidity", "--stiff", "--steps", "--normals"),
+    Method.material: ("--alpha",),
+    Method.arap: ("--rings", *_RIGIDITY, "--alpha"),
+    Method.rc_arap: (*_RIGIDITY, "--alpha"),
+    Method.sr_arap: ("--rings", *_RIGIDITY, "--normals"),
+    Method.laplacian: ("--rings", *_RIGIDITY, "--steps", "--normals", "--alpha"),
 }
 
 
@@ -98,6 +91,12 @@ Stiff = Annotated[
 Rings = Annotated[
     int | None, typer.Option(min=1, help="Size of the cells, in rings of vertices. By default 1.")
 ]
+Alpha = Annotated[
+    float | None,
+    typer.Option(
+        help="With --method sr-arap: how alike the rotations of neighbours are. By default 0.02."
+    ),
+]
 Steps = Annotated[
     int | None,
     typer.Option(
@@ -134,6 +133,7 @@ def deform(
     rigidity: Rigidity = None,
     stiff: Stiff = None,
     rings: Rings = None,
+    alpha: Alpha = None,
     steps: Steps = None,
     frames: Frames = None,
     normals: Annotated[bool, typer.Option(help="Add the normal term (Eq. 4.7).")] = False,
@@ -151,17 +151,21 @@ def deform(
     output.check(shape)  # all arguments are checked before the long work
     options = {"--rigidity": rigidity, "--stiff": stiff, "--rings": rings}
     options |= {"--steps": steps, "--normals": normals}
+    given = {name for name, value in options.items() if value}
+    if alpha is not None:
+        alpha = check_tolerance("--alpha", alpha)
+        given.add("--alpha")
     for name in _UNREAD[method]:
-        if options[name]:
+        if name in given:
             raise jd.InputError(f"{name} means nothing to --method {method.value}: leave it out")
     moves = _read_moves(shape, handles, motion, fix, move, Motion(rotate, about, translate))
     material = read_material(shape, rigidity, stiff or [])
     console.print(str(moves))
-    if method == Method.laplacian:
-        result = _edited(shape, moves, frames)
+    if method.has_energy:
+        way = Way(method, rings or 1, alpha, steps, normals)
+        result = _deformed(shape, moves, material, way, frames)
     else:
-        settings = _Settings(method, material, rings or 1, steps, normals)
-        result = _deformed(shape, moves, settings, frames)
+        result = _edited(shape, moves, frames)
     # The result first, then words about it: whatever happens to those, the work is kept.
     output.save(shape, result.poses, result.rigidity)
     for line in result.words:
@@ -197,14 +201,6 @@ def _read_moves(
     return moves_by_place(shape, fix or [], move, motion)
 
 
-class _Settings(NamedTuple):
-    method: Method
-    material: Material
-    rings: int
-    steps: int | None
-    normals: bool
-
-
 class _Result(NamedTuple):
     poses: Float[np.ndarray, "frames vertices 3"]
     rigidity: Float[np.ndarray, "vertices"] | None
@@ -221,32 +217,27 @@ def _edited(shape: jd.Mesh, moves: Moves, frames: int | None) -> _Result:
     return _Result(patiently("editing", edit), None, [f"edited in {since(began)}"])
 
 
-def _deformed(shape: jd.Mesh, moves: Moves, settings: _Settings, frames: int | None) -> _Result:
-    method, material, rings, steps, normals = settings
+def _deformed(
+    shape: jd.Mesh, moves: Moves, material: Material, way: Way, frames: int | None
+) -> _Result:
     began = time.perf_counter()
-    cells = jd.spokes(shape) if method == Method.arap else jd.rings(shape, rings)
-    problem = patiently("precomputing", lambda: jd.precompute(shape, moves.handles, cells=cells))
+    problem = patiently("precomputing", lambda: way.precompute(shape, moves.handles))
     console.print(f"{shape}, {len(moves.handles)} handles: precomputed in {since(began)}")
     began = time.perf_counter()
-    solver = None if steps is None else jd.Alternating(steps)
-    own = method == Method.material
-    # Cells that only rotate have no strain, and so no use for a rigidity.
-    values = material.at(problem) if own else np.zeros(shape.n_vertices)
-    local = jd.Newton() if own else jd.RotationFit()
-    options: dict[str, Any] = {"local": local, "solver": solver, "normals": normals}
+    values = way.rigidity(material, problem)
+    shown = values if way.method.has_rigidity else None
     if frames is None:
-        run = lambda: jd.deform(problem, moves.targets, values, **options)  # noqa: E731
-        one = patiently("deforming", run)
+        one = patiently("deforming", lambda: way.deform(problem, moves.targets, values))
         energy, done = float(one.energy[-1]), int(one.steps)
         words = [f"energy {energy:.6g} after {done} steps in {since(began)}", jd.Result[one.result]]
-        return _Result(np.asarray(one.vertices)[None], values if own else None, words)
+        return _Result(np.asarray(one.vertices)[None], shown, words)
     path = moves.path(frames)
-    run = lambda tell: jd.deform_path(problem, path, values, progress=tell, **options)  # noqa: E731
+    run = lambda tell: way.deform_path(problem, path, values, tell)  # noqa: E731
     all_ = counted("deforming", frames, run)
     energy, done = float(all_.energy[-1, -1]), int(all_.steps.sum())
     words = [f"energy {energy:.6g} in the last frame, after {done} steps in {since(began)}"]
     words += list(_told(all_, frames))
-    return _Result(np.asarray(all_.vertices), values if own else None, words)
+    return _Result(np.asarray(all_.vertices), shown, words)
 
 
 def _told(path: jd.Solution, frames: int) -> Iterator[str]:

@@ -33,6 +33,7 @@ from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._linalg.lbfgs import has_converged
 from jaxdeform._linalg.rotations import rotation_matrices
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.polygons import triangle_area_vectors
 from jaxdeform._result import Result
 
 # Of the linear system of the derivative: the residual that ends it, and that of the Newton step.
@@ -57,9 +58,7 @@ class SmoothEnergy(NamedTuple):
         of covariances, length squared.
         """
         n, (i, j) = mesh.n_vertices, mesh.edges.T
-        corner = mesh.vertices[mesh.faces]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        area = 0.5 * np.linalg.norm(normal, axis=1).sum()
+        area = np.linalg.norm(triangle_area_vectors(mesh.vertices, mesh.faces), axis=1).sum()
         neighbours = np.bincount(mesh.edges.ravel(), minlength=n)
         b = 0.5 * area * (1.0 / neighbours[i] + 1.0 / neighbours[j])
         upper = sp.coo_matrix((b, (i, j)), (n, n))

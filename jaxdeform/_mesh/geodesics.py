@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 
 from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.mesh import Mesh, connected_components, unique_edges
 from jaxdeform._mesh.selection import check_handles
 
 
@@ -34,18 +34,13 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "ver
     """
     check_type("mesh", mesh, Mesh)
     index = check_handles(sources, mesh, name="source")
-    faces = _manifold_faces(mesh)
-    return np.stack([_distances(mesh, faces, index[[k]]) for k in range(len(index))], axis=1)
+    faces, every = manifold_faces(mesh), np.arange(mesh.n_vertices)
+    each = [exact_distances(mesh, faces, index[[k]], every) for k in range(len(index))]
+    return np.stack(each, axis=1)
 
 
-def distances_to_nearest(
-    mesh: Mesh, sources: Int[np.ndarray, "sources"]
-) -> Float[np.ndarray, "vertices"]:
-    """Return the distance along the surface to the nearest source, for about the time of one."""
-    return _distances(mesh, _manifold_faces(mesh), sources)
-
-
-def _manifold_faces(mesh: Mesh) -> Int[np.ndarray, "solid 3"]:
+def manifold_faces(mesh: Mesh) -> Int[np.ndarray, "solid 3"]:
+    """Return the faces with an area, or raise InputError where libigl cannot walk on them."""
     faces = np.ascontiguousarray(mesh.solid_faces)
     used = np.unique(faces)
     if not (igl.is_edge_manifold(faces)[0] and np.ravel(igl.is_vertex_manifold(faces))[used].all()):
@@ -53,19 +48,29 @@ def _manifold_faces(mesh: Mesh) -> Int[np.ndarray, "solid 3"]:
     return faces
 
 
-def _distances(mesh: Mesh, faces, sources) -> Float[np.ndarray, "vertices"]:
-    label = mesh.components
-    out = np.full(mesh.n_vertices, np.inf)
-    none = np.array([], np.int64)
+def exact_distances(
+    mesh: Mesh,
+    faces: Int[np.ndarray, "faces 3"],
+    sources: Int[np.ndarray, "sources"],
+    targets: Int[np.ndarray, "targets"],
+) -> Float[np.ndarray, "targets"]:
+    """Return how far each target is from the nearest source along these faces, all of them or some.
+
+    No two surfaces of them may meet in a single vertex.
+    """
+    used = np.zeros(mesh.n_vertices, bool)
+    used[faces.ravel()] = True
+    label = connected_components(unique_edges(faces), mesh.n_vertices)
+    on, none = sources[used[sources]], np.array([], np.int64)
     # Where no path exists libigl returns 0, so ask only for vertices that have one.
-    reached = np.flatnonzero(np.isin(label, label[sources]) & mesh.referenced)
-    if len(reached):
-        on = sources[mesh.referenced[sources]]
+    reached = used[targets] & np.isin(label[targets], label[on])
+    out = np.full(len(targets), np.inf)
+    if reached.any():
         # libigl has tolerances of its own: a bar 1e-20 long came out 15 % longer, one of 1e100 as
         # 0, and one of 1e-100 did not end.
         size = mesh.diagonal
         unit = (mesh.vertices - mesh.center) / size
-        out[reached] = igl.exact_geodesic(unit, faces, on, none, reached, none)
+        out[reached] = igl.exact_geodesic(unit, faces, on, none, targets[reached], none)
         out[reached] *= size
-    out[sources] = 0.0
+    out[np.isin(targets, sources)] = 0.0
     return out

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 
 from jaxdeform._errors import InputError
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.polygons import triangle_area_vectors, unit
 
 Points = Float[np.ndarray, "points 3"]
 Faces = Int[np.ndarray, "faces 3"]
@@ -214,9 +215,7 @@ def _relax(points: Points, faces: Faces, cones: list[Cone], width: float) -> Poi
     corner = (np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3)))
     faces_of = sp.coo_matrix(corner, shape=(n, len(faces))).tocsr()
     for _ in range(12):
-        a, b, c = (points[faces[:, k]] for k in range(3))
-        normal = faces_of @ np.cross(b - a, c - a)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = unit(faces_of @ triangle_area_vectors(points, faces))
         move = average @ points - points
         points = points + 0.5 * (move - (move * normal).sum(axis=1, keepdims=True) * normal)
         points = points - normal * _field(points, cones, width)[:, None]

@@ -158,7 +158,10 @@ def _collected(apex: Int[np.ndarray, "polygons n n"]) -> Int[np.ndarray, "polygo
 def area_vectors(
     points: Float[np.ndarray, "points 3"], polygons: Polygons
 ) -> Float[np.ndarray, "polygons 3"]:
-    """Return the mean normal of each polygon (Newell); the lengths are in proportion to areas."""
+    """Return the mean normal of each polygon (Newell); the lengths are in proportion to areas.
+
+    Points of a file may be of any size. Of a mesh, see `triangle_area_vectors`.
+    """
     sizes, corners = polygons
     starts = polygons.starts
     following = np.arange(1, len(corners) + 1)
@@ -167,6 +170,17 @@ def area_vectors(
     corner -= np.repeat(corner[starts], sizes, axis=0)
     corner /= np.abs(corner).max() or 1.0
     return np.add.reduceat(np.cross(corner, corner[following]), starts, axis=0)
+
+
+def triangle_area_vectors(
+    points: Float[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3"]:
+    """Return the normal of each triangle, as long as its area. What is not finite stays in its own.
+
+    The points are those of a mesh, or of a pose of it: their squares are in the range of float64.
+    """
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a) / 2
 
 
 def unit(vectors: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, "rows 3"]:

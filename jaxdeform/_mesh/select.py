@@ -9,8 +9,8 @@ from jaxdeform._arrays import read_host_array, read_numbers
 from jaxdeform._checks import check_count, check_tolerance, check_type, read_axis
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._mesh.expressions import matching
-from jaxdeform._mesh.geodesics import distances_to_nearest
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.nearby import within_distance
 from jaxdeform._mesh.selection import Selection, ranges, read_mask, read_vertices
 
 __all__ = [
@@ -180,8 +180,7 @@ def within(mesh: Mesh, sources: ArrayLike, distance: float) -> Selection:
     """
     check_type("mesh", mesh, Mesh)
     index = _some("sources", sources, mesh, "source")
-    far = distances_to_nearest(mesh, index)
-    return Selection(mesh, far <= check_tolerance("distance", distance))
+    return Selection(mesh, within_distance(mesh, index, check_tolerance("distance", distance)))
 
 
 def component(mesh: Mesh, vertices: ArrayLike) -> Selection:

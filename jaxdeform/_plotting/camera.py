@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.polygons import triangle_area_vectors
 
 # A foot is what lies this close to the ground, as a fraction of the bounding box's diagonal.
 _NEAR = 0.02
@@ -23,8 +24,7 @@ def guess_up(mesh: Mesh) -> Float[np.ndarray, "3"]:
     """
     points = mesh.vertices[mesh.referenced]
     corners = mesh.vertices[mesh.solid_faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1)
+    area = np.linalg.norm(triangle_area_vectors(mesh.vertices, mesh.solid_faces), axis=1)
     middle = (corners.mean(axis=1) * area[:, None]).sum(axis=0) / area.sum()
     best, up = 0.0, None
     for axis in range(3):

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxdeform._mesh.mesh import Mesh, connected_components
+from jaxdeform._mesh.polygons import area_vectors, from_triangles, triangle_area_vectors, unit
 
 # The rest shape has an edge to see where two faces meet at more than this angle.
 _SHARP = np.cos(np.radians(40.0))
@@ -35,7 +36,7 @@ class Surface:
     def normals(self, pose: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "points 3"]:
         """Return the direction of the surface at each point, weighted by area."""
         out = np.zeros((len(self.index), 3))
-        area = np.nan_to_num(_area_vectors(pose, self.mesh.faces))
+        area = np.nan_to_num(triangle_area_vectors(pose, self.mesh.faces))
         for k in range(3):
             np.add.at(out, self.faces[:, k], area)
         length = np.linalg.norm(out, axis=1, keepdims=True)
@@ -75,17 +76,10 @@ class Surface:
         return maps, length * height / 2
 
 
-def _area_vectors(points: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "faces 3"]:
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
-
-
 def _smooth_pairs(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs of corners of one vertex in two faces that meet at a smooth edge."""
     faces, n = mesh.faces, mesh.n_vertices
-    normal = _area_vectors(mesh.vertices / (np.abs(mesh.vertices).max() or 1.0), faces)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.where(length > 0, length, 1)
+    normal = unit(area_vectors(mesh.vertices, from_triangles(faces)))
     begin = np.arange(faces.size)
     end = begin.reshape(-1, 3)[:, [1, 2, 0]].ravel()
     tail, head = faces.ravel()[begin], faces.ravel()[end]

@@ -23,6 +23,7 @@ ROWS = [
         "frames": "5",
     },
     {"mesh": "bar.off", "fix": "v < 0.1", "poses": "bar.off; bar.off"},
+    {"mesh": "bar.off", "handles": "handles.json", "method": "sr-arap", "alpha": "0.0"},
 ]
 
 
@@ -54,13 +55,15 @@ def write(folder, rows, kind="csv"):
 
 @pytest.mark.parametrize("kind", ["csv", "jsonl", "parquet"])
 def test_the_three_formats_give_the_same_jobs(folder, kind):
-    one, two, three = read_manifest(write(folder, ROWS, kind))
+    one, two, three, four = read_manifest(write(folder, ROWS, kind))
     bar = str((folder / "bar.off").resolve())
     assert (one.job, one.mesh, one.rotate, one.rings) == ("one", bar, ("z", 60.0), 1)
     assert (two.rigidity, two.stiff, two.frames) == ("3.5", ("y > 75: 30.0", "x < 0: 1.0"), 5)
     assert three.job == "3"
     assert three.poses == (bar, bar)
-    assert [Job.of_json(job.as_json()) for job in (one, two, three)] == [one, two, three]
+    assert (four.method, four.alpha, one.alpha) == ("sr-arap", 0.0, None)
+    jobs = [one, two, three, four]
+    assert [Job.of_json(job.as_json()) for job in jobs] == jobs
 
 
 def test_json_takes_lists_and_numbers(folder):
@@ -89,6 +92,10 @@ WRONG = {
     "row 2, frames: '2.5': give a whole number": {"frames": "2.5"},
     "row 2, method: 'bones' is no method": {"method": "bones"},
     "row 2: arap has no rigidity": {"method": "arap", "rigidity": "1"},
+    "row 2: sr-arap has no rigidity": {"method": "sr-arap", "stiff": "y > 1: 3"},
+    "row 2: rc-arap has no alpha: leave it out": {"method": "rc-arap", "alpha": "0"},
+    "row 2, alpha: '-1': give a number, 0 or more": {"method": "sr-arap", "alpha": "-1"},
+    "row 2, alpha: 'nan': give a number": {"method": "sr-arap", "alpha": "nan"},
     "row 2: fix and handles exclude each other": {"handles": "handles.json"},
     "row 2: move needs rotate": {"rotate": ""},
     "row 2: no vertices are chosen": {"fix": "", "move": "", "rotate": ""},

@@ -61,16 +61,18 @@ def test_the_command_of_the_readme(deform):
     assert (np.abs(drawn - expected).max(axis=2) > 8).mean() < 1e-3
 
 
-@pytest.mark.parametrize("method", ["arap", "rc-arap", "laplacian"])
+@pytest.mark.parametrize("method", ["arap", "rc-arap", "sr-arap", "laplacian"])
 def test_other_methods_are_those_of_the_documentation(deform, method):
     about = (0.0, 0.5, 0.1)
-    own = {"arap": (), "rc-arap": ("--rings", 2), "laplacian": ()}[method]
+    own = {"rc-arap": ("--rings", 2), "sr-arap": ("--alpha", 0.5)}.get(method, ())
     steps = () if method == "laplacian" else ("--steps", 20)
     code, out, err = deform(*TURN, "--about", *about, "--method", method, *own, *steps)
     assert (code, err) == (0, "")
     mesh, handles, targets = ends(about)
     if method == "laplacian":
         want = jd.laplacian_editing(mesh, handles, targets)
+    elif method == "sr-arap":
+        want = jd.sr_arap(mesh, handles, targets, 0.5, steps=20).vertices
     else:
         cells = jd.spokes(mesh) if method == "arap" else jd.rings(mesh, 2)
         problem = jd.precompute(mesh, handles, cells=cells)
@@ -131,6 +133,11 @@ MISTAKES = {
     "--rings means nothing to --method arap": [*LIFT, "--method", "arap", "--rings", 2],
     "--stiff means nothing to --method rc-arap": [
         *LIFT, "--method", "rc-arap", "--stiff", "y<1", 3,
+    ],
+    "--normals means nothing to --method sr-arap": [*LIFT, "--method", "sr-arap", "--normals"],
+    "--alpha means nothing to --method rc-arap": [*LIFT, "--method", "rc-arap", "--alpha", 0],
+    "--alpha is -1.0: give a finite number, 0 or more": [
+        *LIFT, "--method", "sr-arap", "--alpha", -1,
     ],
     "--normals means nothing to --method laplacian": [
         *LIFT, "--method", "laplacian", "--normals",

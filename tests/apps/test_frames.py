@@ -83,6 +83,19 @@ def test_editing_follows_too_and_names_keep_both_suffixes(deform):
         np.testing.assert_allclose(found, want, atol=1e-8)
 
 
+def test_frames_of_smooth_rotations_start_from_the_frame_before(deform):
+    code, out, err = deform(
+        *WHERE, *MOTION, "--method", "sr-arap", "--steps", 7, "--frames", 3, "-o", "out.obj"
+    )
+    assert (code, err) == (0, "")
+    assert "in the last frame, after 21 steps" in out
+    last = None
+    for k in range(1, 4):
+        mesh, handles, targets = moved_by(k / 3)
+        last = jd.sr_arap(mesh, handles, targets, start=last, steps=7).vertices
+        np.testing.assert_allclose(jd.load_mesh(f"out_000{k}.obj").vertices, last, atol=1e-8)
+
+
 def test_targets_of_a_file_are_reached_on_straight_lines(deform, tmp_path):
     turn = {"axis": [0, 1, 0], "degrees": 170}
     groups = [{"where": "y < 0.1"}, {"where": "y > 0.9", "rotation": turn}]

@@ -93,6 +93,43 @@ def test_within_is_the_distance_to_the_nearest_source(name):
             ]
 
 
+def slivers() -> jd.Mesh:
+    """A sheet whose inner points are moved, some nearly onto the edges between others."""
+    sheet, rng = bumpy_sheet(), np.random.default_rng(3)
+    points = sheet.vertices.copy()
+    inner = ~jd.select.border(sheet).mask
+    points[inner] += rng.uniform(-0.3, 0.3, (inner.sum(), 3))
+    i, j, k = sheet.faces[::5].T
+    low = (points[i] + points[j]) / 2 + 1e-4 * (points[k] - points[i])
+    tips = len(points) + np.arange(len(i))
+    rest = np.delete(sheet.faces, np.s_[::5], axis=0)
+    fans = [np.stack(face, 1) for face in ((i, j, tips), (j, k, tips), (k, i, tips))]
+    return jd.Mesh(np.concatenate([points, low]), np.concatenate([rest, *fans]))
+
+
+@pytest.mark.parametrize("name", ["bar", "sheet", "slivers", "two bars"])
+def test_within_agrees_with_all_distances(name):
+    """Bounds settle most vertices: for every distance as if all had been asked for."""
+    bar, rng = jd.shapes.bar(), np.random.default_rng(1)
+    mesh = {"bar": lambda: bar, "sheet": bumpy_sheet, "slivers": slivers}.get(
+        name,
+        lambda: jd.Mesh(
+            np.concatenate([bar.vertices, bar.vertices + 40]),
+            np.concatenate([bar.faces, bar.faces + bar.n_vertices]),
+        ),
+    )()
+    for count in (1, 3):
+        sources = rng.choice(mesh.n_vertices, count, replace=False)
+        far = jd.geodesic_distances(mesh, sources).min(axis=1)
+        finite = np.sort(far[np.isfinite(far)])
+        # Also exactly at vertices, and beyond all of them.
+        distances = [*(finite[-1] * np.linspace(0.01, 1.1, 25)), *finite[:: finite.size // 9]]
+        for distance in distances:
+            sure = np.abs(far - distance) > 1e-9 * distance
+            found = jd.select.within(mesh, sources, distance).mask
+            np.testing.assert_array_equal(found[sure], (far <= distance)[sure])
+
+
 def test_within_lies_between_straight_lines_and_paths_of_edges():
     """On two sheets side by side: never beyond the straight line, never short of the edges."""
     sheet = bumpy_sheet()

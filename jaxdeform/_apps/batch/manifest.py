@@ -11,12 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import jaxdeform as jd
+from jaxdeform._apps.methods import Method
 from jaxdeform._errors import a_or_an, shown
 from jaxdeform._mesh.expressions import matching
 from jaxdeform._mesh.reading import read_text
 from jaxdeform._mesh.words import real
 
-METHODS = ("material", "arap", "rc-arap")
+# The results of a run are those of methods that have an energy.
+_METHODS = [str(method) for method in Method if method.has_energy]
 
 
 class Job(NamedTuple):
@@ -36,11 +38,13 @@ class Job(NamedTuple):
     stiff: tuple[str, ...] = ()
     rings: int = 1
     poses: tuple[str, ...] = ()
+    alpha: float | None = None
 
     @property
     def problem(self) -> tuple:
         """What jobs of one factor have in common."""
-        return self.mesh, self.handles, self.fix, self.move, self.rings, self.method == "arap"
+        spokes = Method(self.method).has_spokes
+        return self.mesh, self.handles, self.fix, self.move, self.rings, spokes
 
     def as_json(self) -> str:
         """Return the row as text, and nothing that is blank."""
@@ -161,8 +165,10 @@ def _check_together(where: str, job: Job) -> None:
         raise jd.InputError(f"{where}: move needs rotate, translate, or both")
     if job.about and not job.rotate:
         raise jd.InputError(f"{where}: about is the centre of a rotation: give rotate")
-    if job.method != "material" and (job.rigidity or job.stiff or job.poses):
+    if not Method(job.method).has_rigidity and (job.rigidity or job.stiff or job.poses):
         raise jd.InputError(f"{where}: {job.method} has no rigidity: leave out rigidity and stiff")
+    if job.method != Method.sr_arap and job.alpha is not None:
+        raise jd.InputError(f"{where}: {job.method} has no alpha: leave it out")
 
 
 # ---------------------------------------------------------------- one reader a column
@@ -245,9 +251,16 @@ def _count(value: Any, folder: Path) -> int:
 
 
 def _method(value: Any, folder: Path) -> str:
-    if value not in METHODS:
-        raise jd.InputError(f"{shown(value)} is no method: there are {', '.join(METHODS)}")
+    if value not in _METHODS:
+        raise jd.InputError(f"{shown(value)} is no method: there are {', '.join(_METHODS)}")
     return value
+
+
+def _alpha(value: Any, folder: Path) -> float:
+    number = _number(value)
+    if number is None or number < 0:
+        raise jd.InputError(f"{shown(value)}: give a number, 0 or more")
+    return number
 
 
 def _rigidity(value: Any, folder: Path) -> str:
@@ -285,4 +298,5 @@ _READERS: dict[str, Callable[[Any, Path], Any]] = {
     "stiff": _regions,
     "rings": _count,
     "poses": _files,
+    "alpha": _alpha,
 }
