@@ -43,6 +43,7 @@ from jaxdeform._estimation.discrepancy import Discrepancy
 from jaxdeform._estimation.field import FieldEstimate, estimate_rigidity_field
 from jaxdeform._estimation.parts import Estimate, estimate_rigidity
 from jaxdeform._estimation.rigid_groups import RigidGroup, find_handle_groups, find_handles
+from jaxdeform._estimation.segments import segment_rigidity
 from jaxdeform._estimation.thesis import ThesisEstimate, estimate_rigidity_thesis
 from jaxdeform._estimation.verdict import Verdict
 from jaxdeform._handles.files import HandleFile, load_handles
@@ -135,6 +136,7 @@ __all__ = [
     "rings",
     "rotate",
     "save_mesh",
+    "segment_rigidity",
     "select",
     "shapes",
     "spokes",

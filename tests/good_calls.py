@@ -284,6 +284,10 @@ def good_calls(folder: Path) -> dict:
             jd.select.within,
             {"mesh": MESH, "sources": [0, 1], "distance": 1.0},
         ),
+        "segment_rigidity": (
+            jd.segment_rigidity,
+            {"mesh": MESH, "field": np.arange(1.0, N + 1.0), "k": 2, "interval": np.ones((N, 2))},
+        ),
         "spokes": (jd.spokes, {"mesh": MESH, "weights": np.ones(EDGES)}),
         "submesh": (jd.submesh, {"mesh": MESH, "free": [4], "cells": CELLS}),
         "translate": (jd.translate, {"points": MESH.vertices, "offset": [1.0, 2.0, 3.0]}),
@@ -293,11 +297,11 @@ def good_calls(folder: Path) -> dict:
 
 OF_KIND = {
     "numbers": "above base below center centers constant controls deformed degrees distances "
-    "edge_weights handle_weights high low observed offset point points power rest rigidity "
-    "rotations start targets transforms translations vertices weights",
+    "edge_weights field handle_weights high interval low observed offset point points power rest "
+    "rigidity rotations start targets transforms translations vertices weights",
     "indices": "faces group parts r",
     "vertices": "free handles moved sources",
-    "count": "columns count history_length memory max_evaluations max_steps steps width",
+    "count": "columns count history_length k memory max_evaluations max_steps steps width",
     "tolerance": "alpha determined_within distance radius seconds smoothness step_size "
     "target_noise threshold tolerance",
     "path": "path motion",
