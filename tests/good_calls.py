@@ -289,6 +289,7 @@ def good_calls(folder: Path) -> dict:
             {"mesh": MESH, "field": np.arange(1.0, N + 1.0), "k": 2, "interval": np.ones((N, 2))},
         ),
         "spokes": (jd.spokes, {"mesh": MESH, "weights": np.ones(EDGES)}),
+        "stack_problems": (jd.stack_problems, {"problems": [problem, problem]}),
         "submesh": (jd.submesh, {"mesh": MESH, "free": [4], "cells": CELLS}),
         "translate": (jd.translate, {"points": MESH.vertices, "offset": [1.0, 2.0, 3.0]}),
         "twist": (jd.twist, {**move, "along": "y"}),

@@ -46,6 +46,7 @@ SAID |= {
     "faces": "face",
     "handle_weights": "weight of handle",
     "parts": "part of",
+    "problems": "problem",
 }
 
 # Values that an argument may take, though their kind may not.

@@ -9,6 +9,8 @@ import inspect
 import pydoc
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -203,3 +205,14 @@ def test_readme_command_line_is_the_real_one():
 def test_citation_has_the_version_of_the_package():
     (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert cited == jd.__version__
+
+
+def test_importing_loads_what_every_call_needs_and_no_more():
+    """SciPy loads its parts when they are named, and the rest is for pictures, files, clusters."""
+    parts = ["stats", "optimize", "spatial", "interpolate", "sparse.csgraph", "sparse.linalg"]
+    heavy = [*(f"scipy.{part}" for part in parts), "jaxopt", "pyvista", "typer", "zarr", "dask"]
+    program = f"import sys, jaxdeform; print(*[x for x in {heavy} if x in sys.modules])"
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.split() == []

@@ -210,6 +210,10 @@ def wrong_values(kind: str, good, problem) -> dict:
         },
         "cells": lambda: NO_MESH | {"none": 2, "problem": problem, "mesh": MESH},
         "problem": lambda: NO_MESH | {"mesh": MESH, "cells": CELLS, "class": jd.Problem},
+        "problems": lambda: (
+            {f"in a list: {k}": [problem, v] for k, v in NO_MESH.items()}
+            | {"alone": problem, "empty": [], "dict": {0: problem}, "text": "ab", "none": None}
+        ),
         "path": lambda: NO_PATH,
         "source": lambda: NO_SETTING | {"path": Path("a.obj"), "array": MESH.vertices},
         "axis": lambda: no_arrays(problem) | NO_AXIS,

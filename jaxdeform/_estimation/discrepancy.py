@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special
 
 # So many smooth patterns a pose are tried. Of 2,000 right draws on the bar one is rejected; a wrong
 # neighbourhood size, two materials fitted as one, and a warp of 0.3 of the noise are all found.
@@ -76,7 +76,7 @@ def f_test(
     before, after = (_least_cost(x.reshape(-1, parts + 1)) for x in (columns, rough))
     if not after > 0.0:
         return 1.0
-    return float(stats.f.sf((before - after) / added / (after / left), added, left))
+    return float(special.fdtrc(added, left, (before - after) / added / (after / left)))
 
 
 def _least_cost(columns: Float[np.ndarray, "coordinates columns"]) -> float:

@@ -3,7 +3,6 @@
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 # SciPy's flows are 32-bit integers: all capacities together are this many units.
 _UNITS = 1e9
@@ -30,8 +29,8 @@ def cheapest_side(
     capacity = np.concatenate([price, price, np.maximum(gain, 0.0), np.maximum(-gain, 0.0)])
     capacity = np.round(capacity * (_UNITS / max(capacity.sum(), 1e-300))).astype(np.int32)
     graph = sp.csr_matrix((capacity, (rows, columns)), shape=(n + 2, n + 2))
-    left = graph - maximum_flow(graph, source, sink).flow
+    left = graph - sp.csgraph.maximum_flow(graph, source, sink).flow
     left.eliminate_zeros()
     chosen = np.zeros(n + 2, bool)
-    chosen[breadth_first_order(left, source, return_predecessors=False)] = True
+    chosen[sp.csgraph.breadth_first_order(left, source, return_predecessors=False)] = True
     return chosen[:n]

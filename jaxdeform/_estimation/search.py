@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import optimistix as optx
-from scipy import optimize
+import scipy
 
 from jaxdeform._estimation.bounded_gauss_newton import BoundedGaussNewton, Evaluation, recorded
 from jaxdeform._linalg.waiting import settled
@@ -109,4 +109,4 @@ def profile_bound(
 
     if excess(end) <= 0.0:
         return beyond
-    return float(np.asarray(optimize.brentq(excess, best, end, xtol=_BOUND_WIDTH)))
+    return float(np.asarray(scipy.optimize.brentq(excess, best, end, xtol=_BOUND_WIDTH)))

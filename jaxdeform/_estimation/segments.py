@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
-from scipy.sparse.csgraph import connected_components
 
 from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_count, check_type
@@ -19,6 +18,7 @@ from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.graph_cut import cheapest_side
 from jaxdeform._mesh.laplacian import cotangent_weights, difference_matrix, lifted_weights
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.polygons import triangle_area_vectors
 
 # What a border costs, as a length in mean edges. Over 108 fields of the bar in thirds of 0.05, 1
 # and 20, blurred over up to two rows of vertices, with noise of up to 1 in log rigidity, so many
@@ -151,8 +151,8 @@ def _measure(mesh: Mesh) -> tuple[Float[np.ndarray, "edges"], Float[np.ndarray, 
     i, j = mesh.edges.T
     points = mesh.vertices / mesh.diagonal
     long = np.linalg.norm(points[i] - points[j], axis=1)
-    a, b, c = points[mesh.solid_faces].transpose(1, 0, 2) / long.mean()
-    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
+    area = triangle_area_vectors(points / long.mean(), mesh.solid_faces)
+    third = np.linalg.norm(area, axis=1) / 3.0
     areas = np.bincount(mesh.solid_faces.ravel(), np.repeat(third, 3), mesh.n_vertices)
     # A vertex without area must belong to a part too.
     areas = np.maximum(areas, _LEAST * areas.mean())
@@ -234,7 +234,7 @@ class _Borders(NamedTuple):
         i, j = self.edges.T
         same = parts[i] == parts[j]
         graph = sp.csr_matrix((np.ones(same.sum()), (i[same], j[same])), shape=(n, n))
-        count, component = connected_components(graph, directed=False)
+        count, component = sp.csgraph.connected_components(graph, directed=False)
         members = np.split(np.argsort(component, kind="stable"), np.bincount(component).cumsum())
         touching = abs(difference_matrix(self.edges, n)).T.tocsr()
         for inside in sorted(members[:count], key=len):

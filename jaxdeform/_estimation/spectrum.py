@@ -16,9 +16,9 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import stats
-from scipy.interpolate import BSpline
+from scipy import special
 
 # The logarithm of the spectrum is a quadratic spline in the logarithm of the pattern's number, with
 # a penalty on its second differences.
@@ -63,7 +63,7 @@ def spread(
     doubt += 2.0 * (rest * rest_share) ** 2 / rest_freedom
     # Satterthwaite's degrees of freedom, of a variance that is itself an estimate.
     freedom = np.clip(2.0 * variance**2 / np.maximum(doubt, 1e-300), 1.0, 1e6)
-    width = stats.t.ppf(0.975, freedom) * np.sqrt(variance)
+    width = special.stdtrit(freedom, 0.975) * np.sqrt(variance)
     return Spread(width, np.diag(model.inverse)[:parts])
 
 
@@ -136,7 +136,9 @@ def _splines(count: int) -> Float[np.ndarray, "modes splines"]:
     step = inner[1] - inner[0]
     below, above = inner[0] - step * np.arange(2, 0, -1), inner[-1] + step * np.arange(1, 3)
     inside = np.clip(at, inner[0], inner[-1] - 1e-9)
-    return BSpline.design_matrix(inside, np.concatenate([below, inner, above]), 2).toarray()
+    return scipy.interpolate.BSpline.design_matrix(
+        inside, np.concatenate([below, inner, above]), 2
+    ).toarray()
 
 
 def _fit_spline(squares, freedom: int, start):

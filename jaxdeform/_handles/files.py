@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxdeform._checks import check_type, read_path
 from jaxdeform._errors import InputError, shown
@@ -139,7 +139,7 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
         if "center" in given:
             center = _numbers(where, "center", given["center"], (3,))
         # SciPy rotates in double precision, whatever JAX is set to.
-        rotation = Rotation.from_rotvec(axis / length * np.radians(degrees))
+        rotation = scipy.spatial.transform.Rotation.from_rotvec(axis / length * np.radians(degrees))
         points = rotation.apply(points - center) + center
     if "translation" in group:
         points = points + _numbers(where, "translation", group["translation"], (3,))

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from jaxdeform._mesh.grouping import distinct
 
@@ -131,7 +130,7 @@ def vertex_cover(
     first, a = np.unique(one, return_inverse=True)
     second, b = np.unique(two, return_inverse=True)
     graph = sp.csr_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(first), len(second)))
-    partner = maximum_bipartite_matching(graph, perm_type="column")
+    partner = sp.csgraph.maximum_bipartite_matching(graph, perm_type="column")
     matched = np.flatnonzero(partner >= 0)
     back = np.full(len(second), -1)
     back[partner[matched]] = matched

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
 
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.polygons import triangle_area_vectors
@@ -50,8 +50,8 @@ def guess_up(mesh: Mesh) -> Float[np.ndarray, "3"]:
 def _hull_area(points: Float[np.ndarray, "points 2"], inside: np.ndarray | None) -> float:
     """Return the area of the convex hull, or 0 if this point is not inside."""
     try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):  # fewer than three points, or all on a line
+        hull = scipy.spatial.ConvexHull(points)
+    except (scipy.spatial.QhullError, ValueError):  # fewer than three points, or all on a line
         return 0.0
     if inside is not None and (hull.equations @ np.append(inside, 1.0) > 0).any():
         return 0.0

@@ -123,7 +123,8 @@ def real_cells():
         p = length * bent + 0.02 * edge * rng.normal(size=bent.shape)
         b = np.asarray(problem.system.principal_moments)
         lam = np.maximum(np.abs(b).max(axis=0), 1e-300) * 10 ** rng.uniform(-3, 3, b.shape[1])
-        found.append((np.asarray(problem.system.covariance(jnp.asarray(p))), b, lam))
+        c = np.asarray(problem.system.covariance(jnp.asarray(p)))
+        found.append(tuple(v[..., : mesh.n_vertices] for v in (c, b, lam)))
     data = [np.concatenate(x, axis=-1) for x in zip(*found, strict=True)]
     index = np.arange(-(-data[2].size // CHUNK) * CHUNK) % data[2].size
     return [np.stack(np.split(x[..., index], len(index) // CHUNK, axis=-1)) for x in data]
