@@ -170,7 +170,7 @@ def within(mesh: Mesh, sources: ArrayLike, distance: float) -> Selection:
     **Returns** a `Selection`, which has the sources too.
 
     **Raises** InputError: no sources; a source out of range; a distance that is negative or not
-    finite; a surface that is not manifold.
+    finite; a surface that is not manifold, or has faces too flat (see `geodesic_distances`).
 
     Example:
         >>> import jaxdeform as jd

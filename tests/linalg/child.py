@@ -49,7 +49,7 @@ def problem(size: int = 1200, shift: int = 0) -> jd.Problem:
 
 
 def deformed(given: jd.Problem, degrees: float = 60.0, solver=STEPS) -> jax.Array:
-    """Return deformed vertices, on their way."""
+    """Return deformed vertices."""
     targets = jd.bend(given.vertices[np.asarray(given.handles)], degrees)
     return jd.deform(given, targets, 0.1, local=jd.RotationFit(), solver=solver).vertices
 
@@ -130,15 +130,16 @@ def hurried(file: Path) -> None:
     """End while deformations run, one of which has a result that nobody kept."""
     made = problem()
     np.save(file, deformed(made))
-    long = jd.Alternating(300)
-    deformed(made, 10.0, long).block_until_ready()
-    kept = [deformed(made, 20.0, long), deformed(made, 30.0, long)]
+    handles = made.vertices[np.asarray(made.handles)]
+    start = jax.jit(lambda targets: jd.deform(made, targets, 0.1, solver=jd.Alternating(300)))
+    start(handles).vertices.block_until_ready()
+    kept = [start(1.1 * handles), start(1.2 * handles)]
     del kept[0]
     sys.modules["kept"] = kept  # pyright: ignore[reportArgumentType]
 
 
-def interrupted(file: Path) -> None:
-    """Press Ctrl-C while a deformation runs that would take half an hour."""
+def interrupted(file: Path, once: int) -> None:
+    """Press Ctrl-C while a deformation, or an estimate, runs that would take half an hour."""
     made = problem()
     pose = np.asarray(deformed(made))
     np.save(file, pose)
@@ -156,6 +157,8 @@ def interrupted(file: Path) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press, daemon=True).start()
+    if once:
+        deformed(made, solver=jd.Alternating(1_000_000))
     jd.estimate_rigidity(made, pose, solver=jd.Alternating(1_000_000))
 
 

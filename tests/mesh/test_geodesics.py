@@ -1,6 +1,7 @@
 """Distances along a surface, against straight lines and unfoldings."""
 
 import numpy as np
+import pytest
 from helpers import CUBE
 
 import jaxdeform as jd
@@ -22,3 +23,18 @@ def test_geodesic_distances():
     np.testing.assert_allclose(apart[:9, 0], flat[:, 1], atol=1e-7)
     assert np.isinf(apart[9:, 0]).all()
     assert apart[18, 1] == 0
+
+
+@pytest.mark.parametrize("height", [1e-6, 1e-9])
+@pytest.mark.parametrize("size", [1e-20, 1.0])
+def test_faces_too_flat_are_named(height, size):
+    """libigl does not end on some of them."""
+    square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    tip = [[0.5, height, 0.0]]
+    mesh = jd.Mesh(size * np.array(square + tip), [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    for call in (
+        lambda: jd.geodesic_distances(mesh, [2]),
+        lambda: jd.select.within(mesh, [2], 1.0 * size),
+    ):
+        with pytest.raises(jd.InputError, match=r"face \[0, 1, 4\] is too flat"):
+            call()
