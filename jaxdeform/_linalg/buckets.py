@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from jaxdeform._arrays import is_concrete
 from jaxdeform._linalg.waiting import settled
 
-# Four sizes a doubling: 8 % more vertices on average, 20 % at most.
+# Four sizes a doubling: 10 % more vertices on average, 25 % at most.
 _STEPS = 4
 _LEAST = 64
 # Rows of a multiple of 4 KiB fall on the same lines of a cache: 5,120 numbers a row cost 26 % more

@@ -126,7 +126,10 @@ def _with_one_pattern(
 ) -> tuple[sp.csr_matrix, Float[np.ndarray, "out in entries"]]:
     """Return a pattern that holds the entries of all blocks, and their values at its entries."""
     pattern, *others = [block for row in blocks for block in row]
-    same = all(np.array_equal(x.indices, pattern.indices) for x in others)
+    same = all(
+        np.array_equal(x.indptr, pattern.indptr) and np.array_equal(x.indices, pattern.indices)
+        for x in others
+    )
     if not same or not pattern.has_sorted_indices:
         pattern = sp.csr_matrix(sum(abs(block) for row in blocks for block in row))
         pattern.sort_indices()

@@ -220,3 +220,14 @@ def test_the_padding_leaves_no_trace_in_the_program(grid):
     assert {k: found[k] for k in ("gather", "scatter", "pad")} == {
         k: alone[k] for k in ("gather", "scatter", "pad")
     }
+
+
+def test_blocks_of_other_patterns_go_together():
+    """Also where both have the same columns in other rows."""
+    first = sp.csr_matrix(np.array([[1.0, 2.0], [0.0, 0.0]]))
+    second = sp.csr_matrix(np.array([[3.0, 0.0], [0.0, 4.0]]))
+    blocks = [[first], [second]]
+    matrix, transpose = pair(blocks)
+    x = vectors(1, 2, 1)
+    want = np.einsum("ijkl,jlb->ikb", dense(blocks), x)
+    np.testing.assert_allclose(multiply(matrix, transpose, x), want, atol=EXACT)
