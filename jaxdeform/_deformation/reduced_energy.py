@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdeform._deformation.geometry import Geometry, GeometryMaps
 from jaxdeform._deformation.local_step import LocalStep, solve_local_step
@@ -56,12 +56,14 @@ class ReducedEnergy:
             jnp.repeat(x, size, axis=-1)
             for x in (system.principal_moments, system.free, system.soft)
         )
-        inputs = inputs._replace(rigidity=_felt(inputs.rigidity, moments))
+        empty = jnp.all(moments == 0.0, axis=0)
+        rigidity = jnp.where(empty, 1.0, _felt(inputs.rigidity, moments))
+        inputs = inputs._replace(rigidity=rigidity)
         at = None if inputs.geometry is None else GeometryMaps(system, inputs.geometry)
         maps = at or system
-        c = maps.covariance(p, size)
+        c, moments = _at_rest(empty, maps.covariance(p, size), moments)
         if self.normals:
-            t, cells = self._fit_with_normals(system, inputs, p, c, transforms)
+            t, cells = self._fit_with_normals(system, inputs, p, c, moments, transforms)
         elif at is None:
             t = self._fit(transforms, c, moments, inputs.rigidity)
             cells = self.local.energy(t, c, moments, inputs.rigidity)
@@ -78,7 +80,7 @@ class ReducedEnergy:
         scale = total(p * stiff, batch)
         # tr(p^T A p) holds w |p|^2 of the soft handles; completed to w |p - target|^2.
         springs = inputs.soft[None] * inputs.targets * (inputs.targets - 2.0 * p)
-        energy = scale + total(springs, batch) + total(cells, batch)
+        energy = scale + total(springs, batch) + total(jnp.where(empty, 0.0, cells), batch)
         gradient = jnp.where(free[None], stiff - pull, 0.0)
         # The energy is a small difference of terms as large as scale, hence its rounding error.
         rounding = 20.0 * jnp.finfo(p.dtype).eps * jnp.abs(scale)
@@ -99,7 +101,7 @@ class ReducedEnergy:
             return solve_local_step(self.local, c, moments, rigidity)
         return self.local.with_implicit_derivative(transforms, c, moments, rigidity)
 
-    def _fit_with_normals(self, system: System, inputs: Inputs, p, c, transforms):
+    def _fit_with_normals(self, system: System, inputs: Inputs, p, c, moments, transforms):
         """Add one edge of weight 1 from n to n', the normal of the current vertices (Eq. 4.7).
 
         The edge changes B, so here the cells have other principal axes.
@@ -108,7 +110,7 @@ class ReducedEnergy:
         rest_normal = vertex_normals(system.rest, system)
         normal = vertex_normals(p, system)
         axes = system.principal_axes
-        b = einsum("iak,ak,jak->kij", axes, system.principal_moments, axes)
+        b = einsum("iak,ak,jak->kij", axes, moments, axes)
         b = b + einsum("ik,jk->kij", rest_normal, rest_normal)
         moments, new_axes = jnp.linalg.eigh(b)
         new_axes = new_axes * jnp.sign(jnp.linalg.det(new_axes))[:, None, None]
@@ -130,11 +132,20 @@ def _felt(rigidity: Float[Array, "v"], moments: Float[Array, "3 v"]) -> Float[Ar
     The strain is known to eps, so its energy to lambda eps^2, which must stay below what B weighs.
     A cell of lambda = B / (100 eps) is rigid to 100 eps. Without the bound a float32 sheet of
     rigidity 1e12 was 15 % of its length off, and 'Converged'.
-
-    An empty cell is rigid: any T would do for a rigidity of 0.
     """
     most = jnp.max(jnp.abs(moments), axis=0) / (100.0 * jnp.finfo(moments.dtype).eps)
-    return jnp.where(most > 0, jnp.minimum(rigidity, most), 1.0)
+    return jnp.minimum(rigidity, most)
+
+
+def _at_rest(
+    empty: Bool[Array, "v"], c: Float[Array, "3 3 v"], moments: Float[Array, "3 v"]
+) -> tuple[Float[Array, "3 3 v"], Float[Array, "3 v"]]:
+    """Return C and b with empty cells (buckets.py) as if they were at rest, so that T = I.
+
+    A law may divide by b.
+    """
+    one = jnp.eye(3, dtype=c.dtype)[..., None]
+    return jnp.where(empty[None, None], one, c), jnp.where(empty[None], 1.0, moments)
 
 
 def vertex_normals(

@@ -1,5 +1,7 @@
 """Meshes of one bucket share the compiled code, and what fills them up changes nothing."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.monitoring
 import jax.numpy as jnp
@@ -253,3 +255,34 @@ def test_what_a_user_sees_has_its_own_size(mesh):
     assert out.vertices.shape == mesh.vertices.shape
     assert out.transforms.shape == (mesh.n_vertices, 3, 3)
     assert jd.rigidity_from_material(problem, 0.2).shape == (mesh.n_vertices,)
+
+
+@dataclass(frozen=True)
+class SimilarityFit:
+    """A user's own law, which divides by tr(B)."""
+
+    def minimize(self, c, b, rigidity):
+        return _sized(jd.RotationFit().minimize(c, b, rigidity), c, b)
+
+    def with_implicit_derivative(self, t, c, b, rigidity):
+        return t
+
+    def energy(self, t, c, b, rigidity):
+        return jnp.sum(t**2 * b[None] - 2.0 * t * jnp.swapaxes(c, 0, 1), axis=(0, 1))
+
+
+def _sized(rotation, c, b):
+    size = jnp.sum(rotation * jnp.swapaxes(c, 0, 1), axis=(0, 1)) / jnp.sum(b, axis=0)
+    return rotation * size[None, None]
+
+
+@pytest.mark.parametrize("normals", [False, True])
+def test_a_law_of_ones_own_sees_no_empty_cell(mesh, normals):
+    """Where everything grows by a factor, a law of similarities fits exactly."""
+    problem, _ = setting(mesh)
+    rest = mesh.vertices[problem.handles]
+    solver = jd.Alternating(300)
+    out = jd.deform(problem, 1.5 * rest, 0.0, local=SimilarityFit(), solver=solver, normals=normals)
+    assert np.isfinite(out.energy).all()
+    if not normals:
+        np.testing.assert_allclose(out.vertices, 1.5 * mesh.vertices, atol=1e-6)
