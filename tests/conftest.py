@@ -1,6 +1,5 @@
 """Shared set-up: quick compilation, strict JAX, checked shapes, and the fixtures."""
 
-import importlib
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +28,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The annotations of every module are checked at every call (typechecker.py).
 install_import_hook("jaxdeform", "typechecker.check")
 
-from helpers import THESIS, ends
+from helpers import THESIS, ends, without_buckets
 
 import jaxdeform as jd
 
@@ -53,8 +52,7 @@ def bar_targets(bar: jd.Mesh, bar_problem: jd.Problem) -> np.ndarray:
 def exact_sizes():
     """Let arrays be as long as the mesh, without what fills them up to their bucket."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("_deformation.problem", "_deformation.system", "_baselines.laplacian_editing"):
-            patch.setattr(importlib.import_module(f"jaxdeform.{name}"), "bucket", lambda n: n)
+        without_buckets(patch)
         yield
 
 

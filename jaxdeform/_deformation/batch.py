@@ -22,7 +22,6 @@ from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.lbfgs import SLOTS
-from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 
 # Arrays of a member, in numbers per vertex: targets, start, rigidity, positions, transforms, and
@@ -291,5 +290,5 @@ def _finished(chunk: tuple[int, Solution], size: int, count: int) -> tuple[slice
 
         out = jax.tree.map(partial(multihost_utils.process_allgather, tiled=True), out)
     last = min(first + len(out.steps), size)
-    out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), settled(out))
-    return slice(first, last), jax.block_until_ready(settled(cut_to_mesh(out, count)))
+    out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), out)
+    return slice(first, last), jax.block_until_ready(cut_to_mesh(out, count))

@@ -29,9 +29,6 @@ _FAR_IN_FLOAT32 = 1e3
 # of float32: of a bar of 1e-15 the energy was 2 % off, and of 1e-18 it was 300 times too large.
 _LARGEST_IN_FLOAT32 = 1e12
 
-# Faces for each vertex: closed meshes have just below 2.
-_FACES = (2.05,)
-
 
 class Problem(eqx.Module):
     """A mesh with its cells and handles, factored. Made by `precompute`.

@@ -7,11 +7,9 @@ import jax.monitoring
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import without_buckets
 
 import jaxdeform as jd
-from jaxdeform._baselines import laplacian_editing
-from jaxdeform._deformation import problem as problems
-from jaxdeform._deformation import system as systems
 from jaxdeform._linalg.buckets import bucket
 
 AROUND = 8
@@ -175,11 +173,6 @@ TRACED = [gradient, unrolled_gradient, under_vmap]
 @pytest.fixture(scope="module")
 def mesh() -> jd.Mesh:
     return tube(17)
-
-
-def without_buckets(monkeypatch) -> None:
-    for module in (problems, systems, laplacian_editing):
-        monkeypatch.setattr(module, "bucket", lambda n: n)
 
 
 @pytest.mark.parametrize("call", CALLS)
