@@ -8,11 +8,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdeform._deformation.adjoint import Implicit
+from jaxdeform._deformation.arguments import Settings, spread_targets
 from jaxdeform._deformation.descent import Adjoint, Solver
-from jaxdeform._deformation.known_solution import minimum_near
+from jaxdeform._deformation.local_step import Newton
 from jaxdeform._deformation.problem import Problem
-from jaxdeform._deformation.solve import deform
+from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
+from jaxdeform._deformation.solve import deform, solve
+from jaxdeform._deformation.system import System
 from jaxdeform._estimation.poses import Poses
+from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import quick_jit
 
@@ -53,11 +57,39 @@ def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoi
     return settled(found)
 
 
-def pose(problem, targets, field, state: State, solver, adjoint) -> Float[Array, "vertices 3"]:
-    """Return the vertices of one pose, whose state is known, to be differentiated."""
+class Known(NamedTuple):
+    """A pose whose state is known, in arrays of the size of the problem's bucket.
+
+    They are relative to the centre of the rest shape, and in the cells' principal axes.
+    """
+
+    targets: Float[Array, "*poses 3 vertices"]
+    positions: Float[Array, "*poses 3 vertices"]
+    transforms: Float[Array, "*poses 3 3 vertices"]
+
+
+def as_known(problem: Problem, targets: Float[np.ndarray, "handles 3"], state: State) -> Known:
+    """Return a pose as the compiled code takes it: the same code for all meshes of a bucket."""
+    center, count = problem.mesh.center, problem.n_vertices
+    axes = np.asarray(problem.system.principal_axes)[..., :count]
+    spread = spread_targets(problem, (targets - center).T.astype(problem.dtype))
+    positions = (np.asarray(state.vertices) - center).T.astype(problem.dtype)
+    transforms = np.einsum("kaj,jik->aik", np.asarray(state.transforms), axes)
+    return Known(*(fill_up(x, problem.bucket) for x in (spread, positions, transforms)))
+
+
+def pose(system: System, known: Known, field, solver, adjoint) -> Float[Array, "3 vertices"]:
+    """Return the vertices of one pose, relative to the centre, to be differentiated.
+
+    Implicit derivatives are those of the minimum near the known state, so neither the solver nor
+    the local step is part of the program: it compiles in a third of the time of ``deform``.
+    """
+    energy = ReducedEnergy(Newton())
+    inputs = Inputs(known.targets, field, system.soft)
     if isinstance(adjoint, Implicit):
-        return minimum_near(problem, targets, field, *state, adjoint)
-    return deform(problem, targets, field, solver=solver, adjoint=adjoint).vertices
+        return adjoint.minimum(energy, system, inputs, known.positions, known.transforms)[0]
+    out = solve(system, inputs, None, Settings(energy, solver, adjoint))
+    return out.vertices.T - system.center[:, None]
 
 
 def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDerivatives:
@@ -67,13 +99,24 @@ def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDeri
     """
     theta = np.asarray(theta, problem.dtype)
     ends = states(problem, poses, np.exp(theta)[label], solver, adjoint)
+    everywhere = fill_up(label, problem.bucket)
     each = settled(
         [
-            _derivatives(problem, targets, label, theta, state, solver=solver, adjoint=adjoint)
+            _derivatives(
+                problem.system,
+                as_known(problem, targets, state),
+                everywhere,
+                theta,
+                solver=solver,
+                adjoint=adjoint,
+            )
             for targets, state in zip(poses.targets, ends, strict=True)
         ]
     )
-    vertices, jacobian = (np.stack([np.asarray(one[k]) for one in each]) for k in range(2))
+    count = problem.n_vertices
+    relative, slopes = (np.stack([np.asarray(one[k]) for one in each]) for k in range(2))
+    vertices = (np.swapaxes(relative[..., :count], 1, 2) + problem.mesh.center).astype(theta.dtype)
+    jacobian = np.swapaxes(slopes[:, :, :count], 1, 2)
     counted = poses.counted[..., None]
     error = np.stack([np.asarray(state.vertices) for state in ends]) - vertices
     return PoseDerivatives(
@@ -91,8 +134,8 @@ def residual_of(poses: Poses, vertices) -> Float[np.ndarray, "poses vertices 3"]
 
 
 @quick_jit(static=("solver", "adjoint"))
-def _derivatives(problem, targets, label, theta, state: State, solver, adjoint):
+def _derivatives(system: System, known: Known, label, theta, solver, adjoint):
     """Return the vertices of one pose, and their derivatives to each log rigidity."""
-    run = lambda theta: pose(problem, targets, jnp.exp(theta)[label], state, solver, adjoint)  # noqa: E731
+    run = lambda theta: pose(system, known, jnp.exp(theta)[label], solver, adjoint)  # noqa: E731
     push = lambda direction: jax.jvp(run, (theta,), (direction,))  # noqa: E731
     return jax.vmap(push, out_axes=(None, -1))(jnp.eye(len(theta), dtype=theta.dtype))

@@ -22,7 +22,7 @@ from jaxdeform._deformation.problem import Problem, rigidity_from_material
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._errors import ArrayLike
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
-from jaxdeform._estimation.deformed import pose, states
+from jaxdeform._estimation.deformed import Known, as_known, pose, states
 from jaxdeform._estimation.evidence import (
     Evidence,
     Patterns,
@@ -39,6 +39,7 @@ from jaxdeform._estimation.poses import (
     same_length,
 )
 from jaxdeform._estimation.search import Found, search
+from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.waiting import settled
 from jaxdeform._result import Result, succeeded
 
@@ -251,15 +252,19 @@ class _Linearised(NamedTuple):
 
 def _linearise(problem, poses: Poses, theta, solver, adjoint) -> _Linearised:
     ends = states(problem, poses, np.exp(theta), solver, adjoint)
-    state = jax.tree.map(lambda *each: jnp.stack(each), *ends)
-    return settled(_linearise_at(problem, poses, theta, state, solver, adjoint))
+    each = [as_known(problem, *x) for x in zip(poses.targets, ends, strict=True)]
+    known = jax.tree.map(lambda *x: np.stack(x), *each)
+    return settled(_linearise_at(problem, poses, theta, known, solver, adjoint))
 
 
 @eqx.filter_jit
-def _linearise_at(problem, poses: Poses, theta, state, solver, adjoint) -> _Linearised:
+def _linearise_at(problem, poses: Poses, theta, known: Known, solver, adjoint) -> _Linearised:
+    system = problem.system
+
     def run(theta):
-        one = lambda each: pose(problem, each[0], jnp.exp(theta), each[1], solver, adjoint)  # noqa: E731
-        vertices = jax.lax.map(one, (poses.targets, state))
+        field = fill_up(jnp.exp(theta), problem.bucket)
+        each = jax.lax.map(lambda one: pose(system, one, field, solver, adjoint), known)
+        vertices = jnp.swapaxes(each[..., : problem.n_vertices], 1, 2) + system.center
         residual = jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
         return residual, vertices
 

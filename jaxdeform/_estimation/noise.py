@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdeform._estimation.deformed import State, pose
+from jaxdeform._deformation.system import System
+from jaxdeform._estimation.deformed import Known, State, as_known, pose
 from jaxdeform._estimation.poses import Poses
+from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.xla import quick_jit
 
 # Of the bar's 438 handle coordinates about 40 move the free vertices by more than themselves.
@@ -64,19 +66,23 @@ def find_handle_noise(
 
     ``ends`` are the deformations of this field.
     """
-    field = np.asarray(field, problem.dtype)
+    whole = problem.bucket
+    everywhere = fill_up(np.asarray(field, problem.dtype), whole)
     count = min(_MODES, poses.targets[0].size)
-    modes = [
-        _modes(problem, targets, counted, field, end, count=count, solver=solver, adjoint=adjoint)
-        for targets, counted, end in zip(poses.targets, poses.counted, ends, strict=True)
-    ]
-    basis, size, _ = np.linalg.svd(np.asarray(modes, np.float64), full_matrices=False)
+    modes = []
+    for targets, counted, end in zip(poses.targets, poses.counted, ends, strict=True):
+        known = as_known(problem, targets, end)
+        data = problem.system, known, fill_up(counted, whole), everywhere
+        own = np.asarray(_modes(*data, count=count, solver=solver, adjoint=adjoint), np.float64)
+        own = own.reshape(3, whole, count)[:, : problem.n_vertices]
+        modes.append(np.swapaxes(own, 0, 1).reshape(-1, count))
+    basis, size, _ = np.linalg.svd(np.asarray(modes), full_matrices=False)
     return HandleNoise(basis, relative * size)
 
 
 @quick_jit(static=("count", "solver", "adjoint"))
 def _modes(
-    problem, targets, counted, field, state, count: int, solver, adjoint
+    system: System, known: Known, counted, field, count: int, solver, adjoint
 ) -> Float[Array, "coordinates modes"]:
     """Return U with U U^T nearly D D^T, for one pose.
 
@@ -85,13 +91,13 @@ def _modes(
     """
 
     def run(targets):
-        vertices = pose(problem, targets, field, state, solver, adjoint)
-        return jnp.where(counted[:, None], vertices, 0.0)
+        positions = pose(system, known._replace(targets=targets), field, solver, adjoint)
+        return jnp.where(counted[None], positions, 0.0)
 
-    vertices, pull = jax.vjp(run, targets)
-    push = lambda along: jax.jvp(run, (targets,), (along,))[1]  # noqa: E731
-    probes = jax.random.normal(jax.random.key(0), (count, *vertices.shape), vertices.dtype)
+    positions, pull = jax.vjp(run, known.targets)
+    push = lambda along: jax.jvp(run, (known.targets,), (along,))[1]  # noqa: E731
+    probes = jax.random.normal(jax.random.key(0), (count, *positions.shape), positions.dtype)
     (rows,) = jax.vmap(pull)(probes)
     basis, _ = jnp.linalg.qr(rows.reshape(count, -1).T)
-    moved = jax.vmap(push)(basis.T.reshape(count, *targets.shape))
+    moved = jax.vmap(push)(basis.T.reshape(count, *known.targets.shape))
     return moved.reshape(count, -1).T

@@ -149,6 +149,23 @@ def constants(mesh):
     return jd.rigidity_from_material(problem, 0.2)
 
 
+def estimate(mesh):
+    """From a pose with noise whose targets are known."""
+    problem, targets = setting(mesh)
+    out = jd.deform(problem, targets, 0.3)
+    observed = np.asarray(out.vertices) + 1e-3 * np.sin(100.0 * mesh.vertices)
+    fit = jd.estimate_rigidity(problem, observed, targets=targets)
+    return fit.rigidity, fit.interval, np.asarray(fit.misfit)
+
+
+def estimate_of_observed_handles(mesh):
+    """The noise of the handles is probed with random numbers, which depend on the bucket."""
+    problem, targets = setting(mesh)
+    out = jd.deform(problem, targets, 0.3)
+    wave = 1e-3 * np.sin(100.0 * mesh.vertices)
+    return jd.estimate_rigidity(problem, np.asarray(out.vertices) + wave)
+
+
 QUICK = [plain, with_normals, editing, constants, minimality_and_energy]
 SLOW = [
     field_of_rigidity,
@@ -163,6 +180,7 @@ SLOW = [
     submesh,
     editing_with_similarity,
     smooth_rotations,
+    estimate,
 ]
 CALLS = [*QUICK, *(pytest.param(call, marks=pytest.mark.slow) for call in SLOW)]
 
@@ -187,6 +205,7 @@ def test_what_fills_up_changes_nothing(call, mesh, monkeypatch):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_single_precision(mesh, monkeypatch):
     """To what float32 tells apart."""
     problem, targets = setting(mesh, dtype=np.float32)
@@ -200,6 +219,7 @@ def test_single_precision(mesh, monkeypatch):
 
 # Derivatives to the rest shape go edge by edge, and meshes of a bucket differ in their edges.
 SHARED = [call for call in CALLS if gradient_to_rest not in getattr(call, "values", ())]
+SHARED += [pytest.param(estimate_of_observed_handles, marks=pytest.mark.slow)]
 # What JAX runs one by one while it traces an eager call: cutting off what fills up, the loss of
 # these tests, and the transposes of both. No loop, no factor, no product with K.
 CUT = {"slice", "dynamic_slice", "squeeze", "pad", "_pad", "convert_element_type"}
