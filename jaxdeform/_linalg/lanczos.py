@@ -126,7 +126,7 @@ def _lowest(alphas, betas, steps) -> tuple[Float[Array, ""], Float[Array, "most"
             return pivot, pivot
 
         first = jnp.ones_like(shifts)
-        return jax.lax.scan(next_, first, (diagonal, before), unroll=8)[1]
+        return jax.lax.scan(next_, first, (diagonal, before))[1]
 
     def narrow(_, ends):
         low, step = ends
@@ -139,9 +139,9 @@ def _lowest(alphas, betas, steps) -> tuple[Float[Array, ""], Float[Array, "most"
 
     def solved(x: Array) -> Array:
         down = lambda y, row: ((row[0] - row[1] * y) / row[2],) * 2  # noqa: E731
-        _, y = jax.lax.scan(down, jnp.zeros_like(low), (x, before, pivot), unroll=8)
+        _, y = jax.lax.scan(down, jnp.zeros_like(low), (x, before, pivot))
         up = lambda z, row: (row[0] - row[1] * z,) * 2  # noqa: E731
-        _, z = jax.lax.scan(up, jnp.zeros_like(low), (y, after / pivot), reverse=True, unroll=8)
+        _, z = jax.lax.scan(up, jnp.zeros_like(low), (y, after / pivot), reverse=True)
         return z / jnp.sqrt(jnp.sum(z**2))
 
     return low, solved(solved(jnp.where(done, 1.0, 0.0)))
