@@ -114,6 +114,7 @@ def test_bad_jobs_are_named_and_end_no_other(folder, jobs, unbroken):
     assert table["error"][:12] == [None] * 12
 
 
+@pytest.mark.slow
 def test_every_write_may_fail(folder, jobs, unbroken, monkeypatch):
     """The n-th write of the store fails, for each n: the same command then ends the same."""
     write = LocalStore.set

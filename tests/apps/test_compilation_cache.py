@@ -42,6 +42,7 @@ def child(folder, **environment):
     return *json.loads(ran.stdout), ran.stderr
 
 
+@pytest.mark.slow
 def test_the_next_process_finds_the_programs_and_damage_is_mended(tmp_path):
     """Truncated, empty, foreign: compiled anew, replaced, and the same result each time."""
     place, found, first, _ = child("", JAXDEFORM_CACHE_DIR=str(tmp_path / "new" / "folder"))

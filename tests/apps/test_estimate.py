@@ -9,6 +9,7 @@ import jaxdeform as jd
 from jaxdeform._apps.arguments import parts_by_place
 
 
+@pytest.mark.slow
 def test_command_estimates_parts_and_writes_them(run, tmp_path, bar, pose_of, halves):
     rest, pose, out = (tmp_path / name for name in ("rest.ply", "pose.ply", "out.ply"))
     jd.save_mesh(rest, bar)

@@ -37,6 +37,7 @@ def moved_by(share):
     return mesh, handles, targets
 
 
+@pytest.mark.slow
 def test_a_series_of_even_steps(deform, tmp_path):
     (tmp_path / "out_0002.ply").write_text("old")
     (tmp_path / "out_0004.ply").write_text("of a longer series")

@@ -22,6 +22,7 @@ def test_libigl_stays_there(bar, bar_problem):
     assert np.abs(ours - bar.vertices).max() > 0.1 * bar.diagonal
 
 
+@pytest.mark.slow
 def test_larger_cells_agree_more(bar, bar_problem):
     """The rotation between the ends is spread more evenly: ARAP is not what this is."""
     handles, targets = bar_problem.handles, turned(bar, bar_problem)

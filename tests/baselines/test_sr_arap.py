@@ -91,6 +91,7 @@ def test_steps_are_those_of_loops():
     assert bool(out.result == jd.Result.steps_done)
 
 
+@pytest.mark.slow
 def test_alpha_zero_is_arap(bar, bar_problem):
     handles, targets = bar_problem.handles, turned(bar, bar_problem)
     steps = 40
@@ -173,6 +174,7 @@ def slope_of(function, h=1e-3):
     return (8 * (function(h) - function(-h)) - function(2 * h) + function(-2 * h)) / (12 * h)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_minimum():
     def total(s):
         return jnp.sum(seen_along_a_way(s))

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import TWENTY, relative
 
 import jaxdeform as jd
@@ -25,6 +26,7 @@ def test_vmap_over_targets_rigidity_and_start(bar, bar_problem, bar_targets):
         assert relative(mixed[k], jd.deform(bar_problem, bar_targets, lam[k]).vertices) < 1e-6
 
 
+@pytest.mark.slow
 def test_queue_of_lanes_is_every_lane_alone(bar, bar_problem, bar_targets):
     """More lanes than iterate together, of unlike lengths, one of them broken; nested vmap too."""
     lam = np.geomspace(0.01, 100.0, 2 * lbfgs.SLOTS + 5)

@@ -50,6 +50,7 @@ def test_members_are_as_if_alone(plate, alone):
     assert seen == list(range(11))
 
 
+@pytest.mark.slow
 def test_what_is_the_same_for_all_is_given_once(plate, tmp_path):
     problem, targets, rigidity = plate
     field = np.full((1, problem.n_vertices), rigidity[3])

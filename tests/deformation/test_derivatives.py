@@ -107,6 +107,7 @@ def test_all_orders_of_forward_and_reverse_agree(solver):
         np.testing.assert_allclose(other, orders[0], rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_gradient_is_right_at_the_default_tolerance(bar, bar_problem, bar_targets, halves):
     """Of soft and stiff halves, where the state of tolerance 1e-8 alone is up to 2.6 % off."""
     weight = jnp.asarray(np.random.default_rng(0).normal(size=bar.vertices.shape))
@@ -127,6 +128,7 @@ def test_a_gradient_is_right_at_the_default_tolerance(bar, bar_problem, bar_targ
     np.testing.assert_allclose(slope(jd.QuasiNewton(tolerance=1e-6))(x), exact, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_unsolved_linear_system_gives_nan_or_raises(bar_problem, bar_targets):
     def slope(adjoint):
         def loss(r):

@@ -29,6 +29,7 @@ def test_both_solvers_reach_the_same_shape(bar_problem, bar_targets):
     assert bool(fast.ok)
 
 
+@pytest.mark.slow
 def test_a_gradient_that_vanishes_is_a_stationary_energy(bar_problem, bar_targets):
     """The reduced energy does not change to first order at the solution."""
     out = jd.deform(bar_problem, bar_targets, 1.0, solver=jd.QuasiNewton(tolerance=1e-13))

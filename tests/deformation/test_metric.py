@@ -120,6 +120,7 @@ def test_soft_materials_take_few_evaluations(bar, bar_problem, bar_targets, cons
     assert np.argmax(energy <= least * (1 + 1e-4)) <= 10
 
 
+@pytest.mark.slow
 def test_lanes_of_a_batch_have_metrics_of_their_own(bar_problem, bar_targets):
     rigidity = jnp.array([0.0, 0.02, 0.02, 3.0, 900.0])
     many = jax.vmap(lambda x: jd.deform(bar_problem, bar_targets, x))(rigidity)

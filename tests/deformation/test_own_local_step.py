@@ -63,6 +63,7 @@ def test_another_material_reaches_its_own_equilibrium(sheet):
     assert np.abs(ends[jd.Newton()] - ends[Corotated()]).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "local", [Corotated(), pytest.param(jd.AffineFit(), marks=pytest.mark.slow)]
 )
@@ -77,6 +78,7 @@ def test_both_solvers_reach_the_minimum_of_another_energy(sheet, local):
     np.testing.assert_allclose(fast.vertices, slow.vertices, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("steps", "adjoint"), [(5, jd.Unrolled()), (1000, jd.Implicit())], ids=["unrolled", "implicit"]
 )

@@ -40,6 +40,7 @@ def turn(bar) -> Turn:
     return Turn.of(bar, 360.0)
 
 
+@pytest.mark.slow
 def test_a_full_turn_is_not_the_rest_shape(bar, turn):
     problem, targets, rigidity, out = turn
     assert out.vertices.shape == (24, 722, 3)
@@ -89,6 +90,7 @@ def test_frames_start_where_the_text_says(bar, turn):
     assert gap < 0.1 * (plain.energy[0] - plain.energy[-1])
 
 
+@pytest.mark.slow
 def test_the_mirror_image_turns_the_other_way(bar, turn):
     mirror = np.array([-1.0, 1.0, 1.0])
     other = Turn.of(jd.Mesh(bar.vertices * mirror, bar.faces[:, ::-1]), -360.0)
@@ -98,6 +100,7 @@ def test_the_mirror_image_turns_the_other_way(bar, turn):
     np.testing.assert_allclose(seen, turn.out.vertices, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_frames_one_by_one_and_from_a_start(turn):
     problem, targets, rigidity, out = turn
     told = []
@@ -112,6 +115,7 @@ def test_frames_one_by_one_and_from_a_start(turn):
     np.testing.assert_allclose(late.energy[:, -1], out.energy[-2:, -1], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_batches_and_a_frame_that_fails(bar, bar_problem):
     """Under jit and vmap; the frame behind one that fails starts from the last sound one."""
     points = bar.vertices[bar_problem.handles]

@@ -35,6 +35,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("local", "soft"), CASES)
 def test_derivatives_to_the_rest_shape(case, local, soft):
     mesh, handles, targets, rigidity, weight, direction = case
@@ -62,6 +63,7 @@ def test_derivatives_to_the_rest_shape(case, local, soft):
     np.testing.assert_allclose(jnp.sum(jax.grad(loss)(rest) * direction), want, rtol=FD)
 
 
+@pytest.mark.slow
 def test_derivatives_to_the_edge_weights(case):
     mesh, handles, targets, rigidity, weight, _ = case
     w = jd.cotangent_weights(mesh) + 0.3

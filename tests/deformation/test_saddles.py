@@ -21,6 +21,7 @@ def pushed(bar, bar_problem):
     return hold - np.where(hold[:, 1:2] > 75, [[0.0, 30.0, 0.0]], 0.0)
 
 
+@pytest.mark.slow
 def test_the_curvature_is_that_of_the_energy(bar, bar_problem, pushed):
     """Along the direction that it returns, second differences of the energy are negative."""
     out = jd.deform(bar_problem, pushed, 30.0, solver=STAY)
@@ -81,6 +82,7 @@ def test_minima_are_left_alone(bar_problem, bar_targets):
         assert int(out.steps) == int(stays.steps)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_leave_on_their_own(bar_problem, pushed):
     rigidity = jnp.array([1.0, 30.0, 60.0])
     many = jax.jit(jax.vmap(lambda x: jd.deform(bar_problem, pushed, x)))(rigidity)

@@ -101,6 +101,7 @@ def test_bad_handle_weights_get_a_clear_error(sheet, weights, message):
         jd.precompute(sheet[0], [0, 1, 2], handle_weights=weights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "local"),
     [(TIGHT, jd.Newton()), (jd.Alternating(25), jd.RotationFit())],

@@ -33,6 +33,7 @@ def targets(problems) -> np.ndarray:
     return np.stack([problem.vertices[problem.handles] + MOVE for problem in problems])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lam", [0.02, 5.0])
 def test_each_mesh_is_as_if_alone(problems, targets, lam):
     """Also where the metric knows the rigidity (0.02), of which each mesh has a factor."""

@@ -21,6 +21,7 @@ def sheet():
     return jd.precompute(mesh, handles, handle_weights=2.0), targets
 
 
+@pytest.mark.slow
 def test_bad_values_inside_jit_are_said(sheet):
     problem, targets = sheet
     run = jax.jit(lambda t, r, w: jd.deform(problem, t, r, handle_weights=w).result)
@@ -101,6 +102,7 @@ def test_throw_raises_what_result_says(sheet):
     assert bool(jd.deform(problem, targets, 1.0, throw=True).ok)
 
 
+@pytest.mark.slow
 def test_float32_far_from_the_origin_costs_no_digit_of_the_targets():
     near, handles, targets = held_sheet()
     shift = np.array([4e6, -2e6, 1e6])

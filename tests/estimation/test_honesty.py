@@ -25,6 +25,7 @@ def check_it_is_said(fit: jd.Estimate, share: float) -> None:
     assert f"vertex {fit.discrepancy.vertex}" in fit.explain()
 
 
+@pytest.mark.slow
 def test_another_neighbourhood_size(bar, bar_problem, bar_targets):
     wide = jd.precompute(bar, bar_problem.handles, cells=jd.rings(bar, 2))
     seen = np.asarray(jd.deform(wide, bar_targets, 5.0).vertices)
@@ -66,6 +67,7 @@ def test_a_warp_of_the_scan_is_covered_and_said(bar, bar_problem, bar_targets, p
     assert (0.5 if known else 0.2) * size < fit.discrepancy.relative < 1.5 * size
 
 
+@pytest.mark.slow
 def test_right_models_are_not_accused(bar, bar_problem, bar_targets, pose):
     for seed in range(5):
         fit = jd.estimate_rigidity(bar_problem, noisy(bar, pose, seed), targets=bar_targets)
@@ -98,6 +100,7 @@ def test_targets_of_another_frame_are_refused(bar, bar_problem, bar_targets, pos
         jd.estimate_rigidity(bar_problem, pose + 100.0, targets=bar_targets)
 
 
+@pytest.mark.slow
 def test_a_pose_moved_as_a_whole_gives_the_same_answer(bar_problem, pose):
     moved = np.asarray(jd.rotate(pose, 130.0, axis=[1.0, 2.0, 3.0])) + 100.0
     fits = [jd.estimate_rigidity(bar_problem, seen) for seen in (pose, moved)]

@@ -36,6 +36,7 @@ def test_the_interval_allows_for_the_solver_that_made_the_pose(bar_problem, bar_
     assert fit.misfit <= 3.0 * fit.solver_error
 
 
+@pytest.mark.slow
 def test_poses_of_the_thesis_are_fitted_by_its_iteration(bar_problem, pose_of):
     fit = jd.estimate_rigidity(bar_problem, pose_of(1.0), solver=THESIS)
     assert abs(fit.rigidity[0] - 1.0) < 1e-6

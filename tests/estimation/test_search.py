@@ -229,6 +229,7 @@ def test_a_cost_allowed_to_the_end_has_no_bound():
 # ---------------------------------------------------------------- with deformations
 
 
+@pytest.mark.slow
 def test_the_search_says_when_it_was_cut_short(bar_problem, bar_targets, equilibrium_of):
     fit = jd.estimate_rigidity(
         bar_problem, equilibrium_of(30.0), targets=bar_targets, start=0.01, max_evaluations=2

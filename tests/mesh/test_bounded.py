@@ -64,6 +64,7 @@ def test_few_cells_of_real_meshes_are_without_a_bound():
         assert unbounded_cells(bounded_cells(jd.rings(mesh))[0]).size == 0
 
 
+@pytest.mark.slow
 def test_precompute_names_the_cells_and_the_energy_stays_bounded():
     """Without the bound, this deformation ended at an energy of -1.4e150, and said 'Converged'."""
     mesh = real_mesh("decimated-knight.off")

@@ -1,11 +1,13 @@
 """A piece deforms as it would within the whole."""
 
 import numpy as np
+import pytest
 from helpers import TWENTY, relative
 
 import jaxdeform as jd
 
 
+@pytest.mark.slow
 def test_the_submesh_is_the_whole(bar):
     mesh = jd.shapes.cactus()
     free = np.flatnonzero((mesh.vertices[:, 0] > 0.9) & (mesh.vertices[:, 1] < 3.1))
