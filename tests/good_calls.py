@@ -22,6 +22,21 @@ SKIN = {
 }
 WEIGHTS = {"vertices": MESH.vertices, "controls": TWO, "distances": np.ones((N, 2))}
 
+# Results and protocols, which a user does not make; and what sets the whole process
+# (apps/test_compilation_cache.py).
+_NOT_CALLED = (
+    "Adjoint Cells Discrepancy Estimate FieldEstimate HandleFile InputError Inspection LocalStep "
+    "Problem Result RigidGroup Selection Skeleton Solution Solver ThesisEstimate Verdict "
+    "enable_compilation_cache"
+)
+NOT_CALLED = set(_NOT_CALLED.split())
+NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
+FUNCTIONS = {
+    name
+    for name in jd.__all__
+    if callable(getattr(jd, name)) and name not in NOT_CALLED | NO_ARGUMENTS
+} | {f"select.{name}" for name in jd.select.__all__}
+
 
 def good_calls(folder: Path) -> dict:
     """Return a good call of each function: the function, and all its arguments by name."""

@@ -9,7 +9,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from good_calls import HANDLES, MESH, TARGETS, N, good_calls, kind_of
+from good_calls import FUNCTIONS, HANDLES, MESH, TARGETS, N, good_calls, kind_of
 from wrong_values import wrong_values
 
 import jaxdeform as jd
@@ -20,25 +20,6 @@ def calls(tmp_path_factory) -> dict:
     return good_calls(tmp_path_factory.mktemp("calls"))
 
 
-# Results and protocols: a user does not make them.
-NOT_CALLED = {
-    *(
-        "Adjoint",
-        "Cells",
-        "Discrepancy",
-        "Estimate",
-        "FieldEstimate",
-        "HandleFile",
-        "InputError",
-        "Inspection",
-    ),
-    *("LocalStep", "Problem", "Result", "RigidGroup", "Selection", "Skeleton", "Solution"),
-    "Solver",
-    "ThesisEstimate",
-    "Verdict",
-}
-NOT_CALLED |= {"enable_compilation_cache"}  # sets the whole process: apps/test_compilation_cache.py
-NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
 # What the text may call an argument instead of its name.
 SAID = {"handles": "handle", "sources": "source", "weights": "weight", "distances": "distance"}
 SAID |= {
@@ -70,13 +51,6 @@ ALLOWED = {
     ("rings", "r"): {"too large for memory", "largest"},  # cells reach as far as the mesh
     ("rc_arap", "r"): {"too large for memory", "largest"},  # it is that of rings
 }
-
-
-FUNCTIONS = {
-    name
-    for name in jd.__all__
-    if callable(getattr(jd, name)) and name not in NOT_CALLED | NO_ARGUMENTS
-} | {f"select.{name}" for name in jd.select.__all__}
 
 
 def test_every_function_and_argument_is_in_the_table(calls):

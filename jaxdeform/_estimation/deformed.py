@@ -63,9 +63,9 @@ class Known(NamedTuple):
     They are relative to the centre of the rest shape, and in the cells' principal axes.
     """
 
-    targets: Float[Array, "*poses 3 vertices"]
-    positions: Float[Array, "*poses 3 vertices"]
-    transforms: Float[Array, "*poses 3 3 vertices"]
+    targets: Float[Array | np.ndarray, "*poses 3 vertices"]
+    positions: Float[Array | np.ndarray, "*poses 3 vertices"]
+    transforms: Float[Array | np.ndarray, "*poses 3 3 vertices"]
 
 
 def as_known(problem: Problem, targets: Float[np.ndarray, "handles 3"], state: State) -> Known:
@@ -85,7 +85,7 @@ def pose(system: System, known: Known, field, solver, adjoint) -> Float[Array, "
     the local step is part of the program: it compiles in a third of the time of ``deform``.
     """
     energy = ReducedEnergy(Newton())
-    inputs = Inputs(known.targets, field, system.soft)
+    inputs = Inputs(jnp.asarray(known.targets), field, system.soft)
     if isinstance(adjoint, Implicit):
         return adjoint.minimum(energy, system, inputs, known.positions, known.transforms)[0]
     out = solve(system, inputs, None, Settings(energy, solver, adjoint))

@@ -95,7 +95,10 @@ def normalised_laplacian(
 
     Where negative weights bring that sum near 0, 1e-2 of the sum of absolute weights is used.
     """
+    largest = np.max(np.abs(weights), initial=0.0)
+    weights = weights / (largest if largest > 0 else 1.0)  # their scale cancels, but may overflow
     laplacian = graph_laplacian(edges, weights, n_vertices)
     size = sum(np.bincount(end, np.abs(weights), n_vertices) for end in edges.T)
     total = np.maximum(laplacian.diagonal(), 1e-2 * size)
-    return sp.csr_matrix(sp.diags(1.0 / np.where(total > 0, total, 1.0)) @ laplacian)
+    total = np.where(total > np.finfo(float).tiny, total, 1.0)
+    return sp.csr_matrix(sp.diags(1.0 / total) @ laplacian)

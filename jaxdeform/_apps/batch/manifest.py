@@ -81,9 +81,10 @@ def read_manifest(path: Path) -> list[Job]:
     folder = path.resolve().parent
     jobs: list[Job] = []
     seen: dict[str, int] = {}
+    known: dict[tuple[str, str], Any] = {}
     for number, row in enumerate(rows, 1):
         where = f"{path}: row {number}"
-        job = _job(where, number, row, folder)
+        job = _job(where, number, row, folder, known)
         if job.job in seen:
             raise jd.InputError(
                 f"{where}: the job {shown(job.job)} is in row {seen[job.job]} too: give each row "
@@ -125,18 +126,24 @@ def _object(path: Path, number: int, line: str) -> dict[str, Any]:
     return row
 
 
-def _job(where: str, number: int, row: dict[str, Any], folder: Path) -> Job:
+def _job(
+    where: str, number: int, row: dict[str, Any], folder: Path, known: dict[tuple[str, str], Any]
+) -> Job:
+    """Return a checked row. `known` has what the rows above it held, which is mostly the same."""
     values: dict[str, Any] = {"job": str(number)}
     for column, value in row.items():
         if column not in _READERS:
-            known = ", ".join(_READERS)
-            raise jd.InputError(f"{where}: {shown(column)} is no column: there are {known}")
+            columns = ", ".join(_READERS)
+            raise jd.InputError(f"{where}: {shown(column)} is no column: there are {columns}")
         blank = value is None or value == [] or (isinstance(value, str) and not value.strip())
         if not blank and not (isinstance(value, float) and math.isnan(value)):
-            try:
-                values[column] = _READERS[column](value, folder)
-            except jd.InputError as error:
-                raise jd.InputError(f"{where}, {column}: {error}") from error
+            key = column, repr(value)
+            if key not in known:
+                try:
+                    known[key] = _READERS[column](value, folder)
+                except jd.InputError as error:
+                    raise jd.InputError(f"{where}, {column}: {error}") from error
+            values[column] = known[key]
     if "mesh" not in values:
         raise jd.InputError(f"{where}: has no mesh: name its file")
     job = Job(**values)
