@@ -32,6 +32,25 @@ from helpers import THESIS, ends, without_buckets
 
 import jaxdeform as jd
 
+# Minutes each: were they last, one of the two processes would wait for the other.
+_LONGEST = [
+    "test_notebooks.py",
+    "test_docs_code.py",
+    "test_batch_run.py",
+    "test_house.py",
+    "test_bucket.py",
+    "test_parts.py",
+    "test_coverage.py",
+    "test_derivatives.py",
+    "test_metric.py",
+]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files."""
+    place = {name: number for number, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
 
 @pytest.fixture(scope="session")
 def bar() -> jd.Mesh:

@@ -188,8 +188,16 @@ def test_a_job_that_ends_its_workers_is_given_up(folder, jobs):
 def test_an_address_of_fsspec(folder, jobs, unbroken):
     """Another store than a folder, here in memory."""
     check_same(contents(do_all("memory://runs/one", jobs)), unbroken)
-    names = summary.write_table("memory://runs/one", {"job": ["a"]}, True)
-    assert names == ["memory://runs/one/summary.parquet", "memory://runs/one/summary.csv"]
+    assert not summary.has_tables("memory://runs/one", False)
+    summary.write_tables("memory://runs/one", {"job": ["a"]}, False)
+    assert summary.has_tables("memory://runs/one", False)
+    assert not summary.has_tables("memory://runs/one", True)
+    summary.write_tables("memory://runs/one", {"job": ["a"]}, True)
+    assert summary.tables("memory://runs/one", True) == [
+        "memory://runs/one/summary.parquet",
+        "memory://runs/one/summary.csv",
+    ]
+    assert summary.has_tables("memory://runs/one", True)
 
 
 # ---------------------------------------------------------------- the command, in processes
@@ -279,6 +287,6 @@ def test_a_job_without_end_is_given_up(folder, tmp_path):
     endless = job("endless", 1, 1) | {"mesh": "sheet.off", "rings": 400}
     write(folder / "endless.jsonl", [job(1, 1, 1), endless, job(2, 2, 1)])
     words = command(folder / "endless.jsonl", "-o", tmp_path / "run", "--csv", "--tries", 2)
-    ran = subprocess.run([*words, "--time-limit", "60"], capture_output=True, text=True)
+    ran = subprocess.run([*words, "--time-limit", "40"], capture_output=True, text=True)
     assert "3 of 3 jobs done, 1 of them failed" in ran.stdout, ran.stderr
     assert "it ended 2 workers" in (tmp_path / "run" / "summary.csv").read_text()

@@ -117,10 +117,11 @@ def _run(manifest: Path, out: str, options: _Options) -> None:
     cache = bool(jax.config.values.get("jax_compilation_cache_dir"))  # cli.py has set it
     settings = Settings(out, run.new_session(), options.tries, options.time_limit, cache)
     go_on = partial(run.go_on, root, jobs, settings, options.scheduler, options.workers)
-    counted("jobs", len(jobs), lambda tell: go_on(tell, console.print))
-    names = summary.write_table(out, summary.table(root, jobs), options.csv)
+    worked = counted("jobs", len(jobs), lambda tell: go_on(tell, console.print))
+    if worked or not summary.has_tables(out, options.csv):
+        summary.write_tables(out, summary.table(root, jobs), options.csv)
     done, failed, total = summary.count(root, jobs)
     console.print(f"{done} of {total} jobs done, {failed} of them failed, in {since(began)}")
-    console.print(f"wrote {printable(', '.join(names))}")
+    console.print(f"wrote {printable(', '.join(summary.tables(out, options.csv)))}")
     if failed:
         raise typer.Exit(1)

@@ -48,8 +48,10 @@ def go_on(
     workers: int,
     tell: Callable[[int, int], Any],
     say: Callable[[str], Any],
-) -> None:
-    """Do all jobs that are not done. Nothing is lost where it is interrupted.
+) -> bool:
+    """Do all jobs that are not done, and return whether there were any.
+
+    Nothing is lost where it is interrupted.
 
     **Raises** InputError where results cannot be written, or no worker can be had.
     """
@@ -58,7 +60,7 @@ def go_on(
     finished = len(jobs) - sum(len(block.jobs) for block in todo)
     tell(finished, len(jobs))
     if not todo:
-        return
+        return False
     with _client(scheduler, min(workers, len(todo)), settings, say) as client:
         lost: dict[str, int] = {}
         of_future = {client.submit(run_block, x, settings, pure=False): x for x in todo}
@@ -80,6 +82,7 @@ def go_on(
             again = client.submit(run_block, block, settings, pure=False)
             of_future[again] = block
             queue.add(again)
+    return True
 
 
 @contextmanager

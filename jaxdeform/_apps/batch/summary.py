@@ -52,8 +52,21 @@ def table(root: Root, jobs: list[Job]) -> dict[str, list]:
     return columns
 
 
-def write_table(run: str, columns: dict[str, list], as_csv: bool) -> list[str]:
-    """Write the table as Parquet, and on request as CSV; return the names."""
+def tables(run: str, as_csv: bool) -> list[str]:
+    """Return the names of the tables of a run: Parquet, and on request CSV."""
+    return [f"{run.rstrip('/')}/summary.{suffix}" for suffix in ("parquet", "csv")[: 1 + as_csv]]
+
+
+def has_tables(run: str, as_csv: bool) -> bool:
+    """Whether the tables are there. They are written last: the run was finished then."""
+    import fsspec.core
+
+    places = [fsspec.core.url_to_fs(name) for name in tables(run, as_csv)]
+    return all(files.exists(path) for files, path in places)
+
+
+def write_tables(run: str, columns: dict[str, list], as_csv: bool) -> None:
+    """Write the tables."""
     import fsspec
     import pyarrow
     import pyarrow.csv
@@ -63,20 +76,15 @@ def write_table(run: str, columns: dict[str, list], as_csv: bool) -> list[str]:
     kinds |= {name: pyarrow.float64() for name in ("energy", "misfit", "seconds")}
     kinds |= {name: pyarrow.int64() for name in ("steps", "flipped")}
     content = pyarrow.table({k: pyarrow.array(v, kinds[k]) for k, v in columns.items()})
-    writers = {"summary.parquet": pyarrow.parquet.write_table}
-    if as_csv:
-        writers["summary.csv"] = pyarrow.csv.write_csv
-    names = []
-    for name, write in writers.items():
-        file, place = io.BytesIO(), f"{run.rstrip('/')}/{name}"
-        write(content, file)
+    writers = {".parquet": pyarrow.parquet.write_table, ".csv": pyarrow.csv.write_csv}
+    for place in tables(run, as_csv):
+        file = io.BytesIO()
+        writers[Path(place).suffix](content, file)
         if "://" in run:
             with fsspec.open(place, "wb") as remote:
                 remote.write(file.getvalue())  # pyright: ignore[reportAttributeAccessIssue]
         else:
             write_atomically(Path(place), file.getvalue())
-        names.append(place)
-    return names
 
 
 def export(root: Root, jobs: list[Job], folder: Path, suffix: str) -> int:
