@@ -105,7 +105,7 @@ def _resume(count: int) -> Metric:
 
 def _scaling() -> list[Metric]:
     """Time the same jobs, then as many jobs a worker, with 1, 2 and 4 workers."""
-    load, count, found = workloads.tube(5_000), 256, []
+    load, count, found = workloads.tube(5_000), 64, []
     with tempfile.TemporaryDirectory() as name:
         for workers in (1, 2, 4):
             folder = Path(name, str(workers))

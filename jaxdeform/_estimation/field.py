@@ -264,7 +264,7 @@ def _linearise_at(problem, poses: Poses, theta, known: Known, solver, adjoint) -
     def run(theta):
         field = fill_up(jnp.exp(theta), problem.bucket)
         each = jax.lax.map(lambda one: pose(system, one, field, solver, adjoint), known)
-        vertices = jnp.swapaxes(each[..., : problem.n_vertices], 1, 2) + system.center
+        vertices = jnp.swapaxes(each[..., : problem.n_vertices], 1, 2) + system.center[None, None]
         residual = jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
         return residual, vertices
 
