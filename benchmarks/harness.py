@@ -14,6 +14,8 @@ from typing import Any
 import jax
 
 ROOT = Path(__file__).parents[1]
+PROGRAM = Path(sys.executable).parent / "jaxdeform"
+"""The command line, as it was installed beside this Python."""
 
 
 def interleaved(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:

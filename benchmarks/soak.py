@@ -1,27 +1,25 @@
 """Is memory flat and the rate steady over a long run? ``python -m benchmarks.soak`` (Linux only).
 
 20,000 small deformations in one process, of a problem made anew every 200; then 2,000 jobs of
-``jaxdeform batch`` over a local cluster. Prints the tables of docs/scaling.md.
+``jaxdeform batch`` over a local cluster. Prints a table.
 """
 
 import argparse
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
-import igl
 import jax
 import numpy as np
 import psutil
 
 import jaxdeform as jd
+from benchmarks.harness import PROGRAM
+from benchmarks.workloads import small_bar
 
-FACES = 520
-"""Of the decimated bar: 262 vertices."""
 PROBLEM_LASTS = 200
 SAMPLES = 40
 SETTLED = 0.25
@@ -29,13 +27,6 @@ SETTLED = 0.25
 
 Sample = tuple[float, int, float]
 """Seconds since the start, deformations done, resident MiB."""
-
-
-def small_bar() -> jd.Mesh:
-    """Return the bar with 262 vertices."""
-    whole = jd.shapes.bar()
-    vertices, faces, *_ = igl.decimate(whole.vertices, whole.faces, FACES)
-    return jd.Mesh(vertices, faces)
 
 
 def one_process(count: int) -> Iterator[Sample]:
@@ -72,10 +63,9 @@ def cluster(count: int, workers: int) -> Iterator[Sample]:
         manifest = folder / "jobs.csv"
         manifest.write_text("\n".join(["mesh,fix,move,rotate,rigidity", *rows]) + "\n")
         run = folder / "run"
-        program = Path(sys.executable).parent / "jaxdeform"
         words = ["batch", manifest, "-o", run, "--workers", str(workers)]
         began = time.perf_counter()
-        child = psutil.Popen([program, *words], stdout=subprocess.DEVNULL)
+        child = psutil.Popen([PROGRAM, *words], stdout=subprocess.DEVNULL)
         jobs: list = []
         while child.poll() is None:
             time.sleep(2.0)

@@ -59,6 +59,13 @@ def bar() -> Workload:
     return _bent("bar", mesh, (mesh.vertices[:, 1] < 6) | (mesh.vertices[:, 1] > 145))
 
 
+def small_bar() -> jd.Mesh:
+    """Return the bar decimated to 262 vertices."""
+    whole = jd.shapes.bar()
+    vertices, faces, *_ = igl.decimate(whole.vertices, whole.faces, 520)
+    return jd.Mesh(vertices, faces)
+
+
 def cylinder() -> Workload:
     """A closed cylinder bent by 90 degrees: 4,802 vertices."""
     mesh = jd.shapes.cylinder()

@@ -1,7 +1,6 @@
 """Runs that outgrow one call: what ``deform_batch`` and ``jaxdeform batch`` cost beside a loop."""
 
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -11,10 +10,8 @@ import numpy as np
 
 import jaxdeform as jd
 from benchmarks import workloads
-from benchmarks.harness import interleaved, run_child
+from benchmarks.harness import PROGRAM, interleaved, run_child
 from benchmarks.metrics import Findings, Metric
-
-PROGRAM = Path(sys.executable).parent / "jaxdeform"
 
 
 def run(quick: bool) -> Findings:

@@ -66,17 +66,19 @@ def find_handle_noise(
 
     ``ends`` are the deformations of this field.
     """
-    whole = problem.bucket
+    system, whole = problem.system, problem.bucket
     everywhere = fill_up(np.asarray(field, problem.dtype), whole)
-    count = min(_MODES, poses.targets[0].size)
-    modes = []
-    for targets, counted, end in zip(poses.targets, poses.counted, ends, strict=True):
-        known = as_known(problem, targets, end)
-        data = problem.system, known, fill_up(counted, whole), everywhere
-        own = np.asarray(_modes(*data, count=count, solver=solver, adjoint=adjoint), np.float64)
-        own = own.reshape(3, whole, count)[:, : problem.n_vertices]
-        modes.append(np.swapaxes(own, 0, 1).reshape(-1, count))
-    basis, size, _ = np.linalg.svd(np.asarray(modes), full_matrices=False)
+    settings = {"count": min(_MODES, poses.targets[0].size), "solver": solver, "adjoint": adjoint}
+    each = [
+        _modes(
+            system, as_known(problem, targets, end), fill_up(seen, whole), everywhere, **settings
+        )
+        for targets, end, seen in zip(poses.targets, ends, poses.counted, strict=True)
+    ]
+    modes = np.asarray(each, np.float64)
+    modes = modes.reshape(len(each), 3, whole, -1)[:, :, : problem.n_vertices]
+    modes = np.swapaxes(modes, 1, 2).reshape(len(each), 3 * problem.n_vertices, -1)
+    basis, size, _ = np.linalg.svd(modes, full_matrices=False)
     return HandleNoise(basis, relative * size)
 
 
