@@ -7,7 +7,8 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,23 @@ def interleaved(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[
     finally:
         gc.enable()
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+@contextmanager
+def compilations() -> Iterator[list[str]]:
+    """Yield a list to which the name of each function that XLA compiles meanwhile is added."""
+    compiled: list[str] = []
+
+    def listen(event: str, duration_secs: float, **rest: Any) -> None:
+        del duration_secs
+        if event.endswith("backend_compile_duration"):
+            compiled.append(rest["fun_name"].removeprefix("jit(").removesuffix(")"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def run_child(name: str, *arguments: object, environment: Mapping[str, str] | None = None) -> Any:

@@ -7,6 +7,7 @@ import numpy as np
 
 import jaxdeform as jd
 from benchmarks import workloads
+from benchmarks.harness import compilations
 from benchmarks.metrics import Findings, Metric
 from benchmarks.workloads import Workload
 
@@ -46,14 +47,11 @@ def _drag(load: Workload, problem: jd.Problem, rigidity, frames: int) -> tuple[f
 
 def _compilations_of_other_handles(load: Workload, rigidity) -> int:
     """Return how often XLA compiles when two other sets of handles are deformed."""
-    compiled: list[str] = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
-    )
-    for foot in (0.2, 0.4):
-        y = load.mesh.vertices[:, 1]
-        handles = np.flatnonzero((y < foot) | (y > 4.2))
-        other = jd.precompute(load.mesh, handles)
-        targets = load.mesh.vertices[handles] + 0.1
-        jd.deform(other, targets, rigidity, solver=SOLVER, start=load.start)
+    with compilations() as compiled:
+        for foot in (0.2, 0.4):
+            y = load.mesh.vertices[:, 1]
+            handles = np.flatnonzero((y < foot) | (y > 4.2))
+            other = jd.precompute(load.mesh, handles)
+            targets = load.mesh.vertices[handles] + 0.1
+            jd.deform(other, targets, rigidity, solver=SOLVER, start=load.start)
     return len(compiled)

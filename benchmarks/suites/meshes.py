@@ -7,6 +7,7 @@ import numpy as np
 
 import jaxdeform as jd
 from benchmarks import workloads
+from benchmarks.harness import compilations
 from benchmarks.metrics import Findings, Metric
 from benchmarks.workloads import Workload
 
@@ -17,15 +18,8 @@ SIZES = range(4500, 5100, 60)
 def run(quick: bool) -> Findings:
     loads = [workloads.tube(size) for size in list(SIZES)[: 4 if quick else None]]
     _deform(loads[0])
-    compiled: list[str] = []
-
-    def listen(event: str, *_: object, **__: object) -> None:
-        if "backend_compile" in event:
-            compiled.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    seconds = np.array([[_deform(load), _deform(load)] for load in loads[1:]])
-    jax.monitoring.unregister_event_duration_listener(listen)
+    with compilations() as compiled:
+        seconds = np.array([[_deform(load), _deform(load)] for load in loads[1:]])
     first, second = np.median(seconds, axis=0)
     name = f"tubes, {loads[0].mesh.n_vertices:,} to {loads[-1].mesh.n_vertices:,} vertices"
     return Findings(

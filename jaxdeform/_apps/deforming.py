@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import MEDIUM, Material, read_material
-from jaxdeform._apps.methods import Method, Way
+from jaxdeform._apps.methods import Method, MethodSettings
 from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
 from jaxdeform._apps.output import Output
 from jaxdeform._apps.talk import console, counted, patiently, since
@@ -162,8 +162,8 @@ def deform(
     material = read_material(shape, rigidity, stiff or [])
     console.print(str(moves))
     if method.has_energy:
-        way = Way(method, rings or 1, alpha, steps, normals)
-        result = _deformed(shape, moves, material, way, frames)
+        settings = MethodSettings(method, rings or 1, alpha, steps, normals)
+        result = _deformed(shape, moves, material, settings, frames)
     else:
         result = _edited(shape, moves, frames)
     # The result first, then words about it: whatever happens to those, the work is kept.
@@ -218,21 +218,21 @@ def _edited(shape: jd.Mesh, moves: Moves, frames: int | None) -> _Result:
 
 
 def _deformed(
-    shape: jd.Mesh, moves: Moves, material: Material, way: Way, frames: int | None
+    shape: jd.Mesh, moves: Moves, material: Material, settings: MethodSettings, frames: int | None
 ) -> _Result:
     began = time.perf_counter()
-    problem = patiently("precomputing", lambda: way.precompute(shape, moves.handles))
+    problem = patiently("precomputing", lambda: settings.precompute(shape, moves.handles))
     console.print(f"{shape}, {len(moves.handles)} handles: precomputed in {since(began)}")
     began = time.perf_counter()
-    values = way.rigidity(material, problem)
-    shown = values if way.method.has_rigidity else None
+    values = settings.rigidity(material, problem)
+    shown = values if settings.method.has_rigidity else None
     if frames is None:
-        one = patiently("deforming", lambda: way.deform(problem, moves.targets, values))
+        one = patiently("deforming", lambda: settings.deform(problem, moves.targets, values))
         energy, done = float(one.energy[-1]), int(one.steps)
         words = [f"energy {energy:.6g} after {done} steps in {since(began)}", jd.Result[one.result]]
         return _Result(np.asarray(one.vertices)[None], shown, words)
     path = moves.path(frames)
-    run = lambda tell: way.deform_path(problem, path, values, tell)  # noqa: E731
+    run = lambda tell: settings.deform_path(problem, path, values, tell)  # noqa: E731
     all_ = counted("deforming", frames, run)
     energy, done = float(all_.energy[-1, -1]), int(all_.steps.sum())
     words = [f"energy {energy:.6g} in the last frame, after {done} steps in {since(began)}"]

@@ -39,7 +39,7 @@ class Method(StrEnum):
         return self in (Method.arap, Method.sr_arap)
 
 
-class Way(NamedTuple):
+class MethodSettings(NamedTuple):
     """How the vertices without a target follow: a method that has an energy, with its settings.
 
     What the method does not read is not looked at.

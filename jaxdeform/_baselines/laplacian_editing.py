@@ -11,7 +11,7 @@ from jaxdeform._arrays import is_concrete
 from jaxdeform._checks import check_flag, check_precision, check_targets, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._handles.split import split_handles
-from jaxdeform._linalg.buckets import bucket, cut, fill_up
+from jaxdeform._linalg.buckets import bucket, cut, enlarge, fill_up
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
 from jaxdeform._linalg.ell import WIDTHS, EllMatrix
 from jaxdeform._mesh.cells import spokes
@@ -128,7 +128,7 @@ def laplacian_editor(
         operator, positions = laplacian, mesh.vertices
         pull = (laplacian.T @ (laplacian @ mesh.vertices)).T
     dtype, size = np.dtype(jnp.result_type(float)), bucket(n)
-    normal = _enlarged(operator.T @ operator + sp.diags(soft), n, size)
+    normal = enlarge(operator.T @ operator + sp.diags(soft), size, len(soft) // n)
 
     def filled_up(x: np.ndarray) -> np.ndarray:
         """Fill up the vertices of each coordinate, or of all of them at once."""
@@ -151,14 +151,6 @@ def laplacian_editor(
         factor=factor,
     )
     return LaplacianEditor(put(mesh.vertices), index, equations)
-
-
-def _enlarged(matrix: sp.spmatrix, n: int, size: int) -> sp.csr_matrix:
-    """Return a matrix of blocks (n, n) as one of blocks (size, size), with rows that are empty."""
-    given = sp.coo_matrix(matrix)
-    row, column = (x // n * size + x % n for x in (given.row, given.col))
-    width = matrix.shape[0] // n * size
-    return sp.csr_matrix((given.data, (row, column)), shape=(width, width))
 
 
 def laplacian_editing(

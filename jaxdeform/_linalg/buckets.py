@@ -69,8 +69,9 @@ def cut(x: jax.Array, count: int, axis: int = -1) -> jax.Array:
     return x[at]
 
 
-def enlarge(matrix: sp.spmatrix, size: int) -> sp.csr_matrix:
-    """Return a square sparse matrix with empty rows and columns added."""
-    out = sp.csr_matrix(matrix, copy=True)
-    out.resize((size, size))
-    return out
+def enlarge(matrix: sp.spmatrix, size: int, blocks: int = 1) -> sp.csr_matrix:
+    """Return a square sparse matrix with empty rows and columns added to each of its blocks."""
+    given = sp.coo_matrix(matrix)
+    n = matrix.shape[0] // blocks
+    row, column = (x // n * size + x % n for x in (given.row, given.col))
+    return sp.csr_matrix((given.data, (row, column)), shape=(blocks * size, blocks * size))

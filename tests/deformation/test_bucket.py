@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import jax
-import jax.monitoring
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import without_buckets
 
 import jaxdeform as jd
+from benchmarks.harness import compilations
 from jaxdeform._linalg.buckets import bucket
 
 AROUND = 8
@@ -231,18 +231,9 @@ def test_meshes_of_a_bucket_compile_once(call):
     meshes = [tube(rows) for rows in range(17, 21)]
     assert len({bucket(mesh.n_vertices) for mesh in meshes}) == 1
     call(meshes[-1])
-    compiled = []
-
-    def listen(event, seconds, **rest):
-        if event.endswith("backend_compile_duration"):
-            compiled.append(rest["fun_name"].removeprefix("jit(").removesuffix(")"))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with compilations() as compiled:
         for mesh in meshes[:-1]:
             call(mesh)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert set(compiled) <= (CUT | LOSS if call in TRACED else set())
 
 

@@ -3,6 +3,7 @@
 import os
 import time
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -54,12 +55,9 @@ def batch(
     csv: Annotated[bool, typer.Option("--csv", help="Write the summary as CSV too.")] = False,
 ) -> None:
     """Do many jobs: deformations and fits of many meshes. The same command goes on after a stop."""
-    try:
-        import distributed  # noqa: F401
-        import pyarrow  # noqa: F401
-        import zarr  # noqa: F401
-    except ImportError as error:
-        raise jd.InputError(f"{MISSING} ({error})") from error
+    missing = [name for name in ("distributed", "pyarrow", "zarr") if find_spec(name) is None]
+    if missing:
+        raise jd.InputError(f"{MISSING} (there is no {', no '.join(missing)})")
     if status is not None:
         _tell(status)
     elif out is None:

@@ -1,21 +1,15 @@
-"""A batch run: plan, hand out blocks to workers, go on where it was interrupted."""
+"""A batch run: plan, and go on where it was interrupted."""
 
-import logging
 import secrets
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import dask.config
-from distributed import Client, LocalCluster, as_completed
-from distributed.scheduler import KilledWorker
 
 import jaxdeform as jd
 from jaxdeform._apps.batch import store
 from jaxdeform._apps.batch.manifest import Job
 from jaxdeform._apps.batch.store import Root
-from jaxdeform._apps.batch.worker import Settings, run_block
+from jaxdeform._apps.batch.worker import Settings
 
 
 def planned(run: str, jobs: list[Job]) -> Root:
@@ -61,68 +55,17 @@ def go_on(
     tell(finished, len(jobs))
     if not todo:
         return False
-    with _client(scheduler, min(workers, len(todo)), settings, say) as client:
-        lost: dict[str, int] = {}
-        of_future = {client.submit(run_block, x, settings, pure=False): x for x in todo}
-        queue = as_completed(of_future)
-        for future in queue:
-            block = of_future.pop(future)
-            error = future.exception()
-            if error is None:
-                finished += len(block.jobs)
-                tell(finished, len(jobs))
-                continue
-            lost[block.key] = lost.get(block.key, 0) + 1
-            most = settings.tries * (len(block.jobs) + 1)
-            if not isinstance(error, KilledWorker) or lost[block.key] > most:
-                raise jd.InputError(
-                    f"{settings.run}: the run stopped ({type(error).__name__}: {error}). What is "
-                    "done is kept: mend it, and run the same command again"
-                ) from error
-            again = client.submit(run_block, block, settings, pure=False)
-            of_future[again] = block
-            queue.add(again)
+    from jaxdeform._apps.batch.cluster import work_off  # Dask takes half a second to import
+
+    work_off(
+        todo,
+        settings,
+        scheduler,
+        min(workers, len(todo)),
+        lambda done: tell(finished + done, len(jobs)),
+        say,
+    )
     return True
-
-
-@contextmanager
-def _client(
-    scheduler: str | None, workers: int, settings: Settings, say: Callable[[str], Any]
-) -> Iterator[Client]:
-    """Connect to the scheduler, or start workers of our own, which only this machine can reach."""
-    for name in ("distributed", "tornado", "asyncio"):  # a lost worker is part of the plan
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=30)
-        except (OSError, ValueError) as error:
-            raise jd.InputError(
-                f"--scheduler {scheduler}: cannot be reached ({error}): start one with 'dask "
-                "scheduler', and workers with 'dask worker'"
-            ) from error
-        with client:
-            say(f"dashboard: {client.dashboard_link}")
-            yield client
-        return
-    # A block that loses its worker is tried again; worker.py counts how often.
-    with dask.config.set({"distributed.scheduler.allowed-failures": settings.tries * 100}):
-        try:
-            cluster = LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,  # JAX has its own
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,
-                env={"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            )
-        except Exception as error:  # whatever Dask raises where a worker dies at its start
-            raise jd.InputError(
-                f"the workers could not be started ({type(error).__name__}: {error}): run the same "
-                "command again"
-            ) from error
-        with cluster, Client(cluster) as client:
-            say(f"{workers} workers, dashboard: {client.dashboard_link}")
-            yield client
 
 
 def new_session() -> str:

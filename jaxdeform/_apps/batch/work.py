@@ -12,7 +12,7 @@ from jaxtyping import Float
 import jaxdeform as jd
 from jaxdeform._apps.arguments import read_material, read_pose
 from jaxdeform._apps.batch.manifest import Job
-from jaxdeform._apps.methods import Method, Way
+from jaxdeform._apps.methods import Method, MethodSettings
 from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
 from jaxdeform._mesh.select import some_where
 from jaxdeform._result import name_of
@@ -66,22 +66,22 @@ def _prepared(key: tuple, job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
         moves = moves_by_place(mesh, [job.fix] if job.fix else [], job.move, motion)
         handles = moves.handles
     if not _kept or _kept[0] != key:
-        _kept[:] = key, _way(job).precompute(mesh, handles)
+        _kept[:] = key, _settings(job).precompute(mesh, handles)
     return mesh, moves, _kept[1]
 
 
-def _way(job: Job) -> Way:
-    return Way(Method(job.method), job.rings, job.alpha)
+def _settings(job: Job) -> MethodSettings:
+    return MethodSettings(Method(job.method), job.rings, job.alpha)
 
 
 def _deform(job: Job, mesh: jd.Mesh, moves: Moves | None, problem: jd.Problem) -> Done:
     assert moves is not None
-    way = _way(job)
-    rigidity = way.rigidity(read_material(mesh, job.rigidity, list(job.stiff)), problem)
+    settings = _settings(job)
+    rigidity = settings.rigidity(read_material(mesh, job.rigidity, list(job.stiff)), problem)
     if job.frames is None:
-        out = way.deform(problem, moves.targets, rigidity)
+        out = settings.deform(problem, moves.targets, rigidity)
     else:
-        path = way.deform_path(problem, moves.path(job.frames), rigidity)
+        path = settings.deform_path(problem, moves.path(job.frames), rigidity)
         out = jax.tree.map(lambda x: x[-1], path)
     return Done(
         np.asarray(out.vertices),
