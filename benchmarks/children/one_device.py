@@ -25,6 +25,7 @@ from benchmarks.workloads import Workload  # noqa: E402
 LOADS: dict[str, Callable[[], Workload]] = {
     "bar": workloads.bar,
     "cylinder": workloads.cylinder,
+    "cactus": workloads.cactus,
     "octopus": lambda: workloads.octopus(50_000),
 }
 STEPS = 20

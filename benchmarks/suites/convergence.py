@@ -10,6 +10,7 @@ from benchmarks import workloads
 from benchmarks.harness import interleaved
 from benchmarks.metrics import Curve, Findings, Metric
 from benchmarks.workloads import Workload
+from jaxdeform._errors import ArrayLike
 
 NEAR = 1e-4
 
@@ -19,7 +20,7 @@ class Case(NamedTuple):
 
     name: str
     problem: jd.Problem
-    rigidity: float
+    rigidity: ArrayLike
     local: jd.LocalStep
     target: float
 
@@ -27,7 +28,10 @@ class Case(NamedTuple):
 class Ours(NamedTuple):
     """How QuasiNewton gets near the minimum."""
 
+    of: Callable[[jd.Problem], object]
+    """Runs it on a problem like that of the case."""
     run: Callable[[], object]
+    """Runs it on that of the case."""
     energies: list[float]
     """After each iteration, relative to the minimum, less 1."""
 
@@ -50,7 +54,7 @@ def _convergence(load: Workload, repeats: int) -> tuple[list[Metric], dict[str, 
     cases += [Case(f"rigidity {x:g}", problem, x, jd.Newton(), 0.8) for x in (1.0, 0.05)]
     peer_steps, peer_energies = _libigl_descent(load, rigid)
     data = load.libigl(peer_steps[-1])
-    ours = {case.name: _our_descent(load, case) for case in cases}
+    ours = {case.name: our_descent(load, case) for case in cases}
     runs: dict[str, Callable[[], object]] = {
         "libigl": lambda: load.run_libigl(data, peer_steps[-1])
     }
@@ -59,7 +63,7 @@ def _convergence(load: Workload, repeats: int) -> tuple[list[Metric], dict[str, 
     curves: dict[str, Curve] = {
         "libigl ARAP, rigid": ([k * per for k in peer_steps], peer_energies)
     }
-    for name, (_, energies) in ours.items():
+    for name, (*_, energies) in ours.items():
         per = seconds[name] / max(1, len(energies) - 1)
         curves[f"jaxdeform, {name}"] = ([k * per for k in range(len(energies))], energies)
     return _metrics(load, cases, seconds, peer_steps[-1]), curves
@@ -77,16 +81,16 @@ def _metrics(load: Workload, cases: list[Case], seconds, peer_steps: int) -> lis
     return out
 
 
-def _our_descent(load: Workload, case: Case) -> Ours:
+def our_descent(load: Workload, case: Case) -> Ours:
     """Return QuasiNewton's run to within NEAR of its own minimum."""
-    energy = _energies(load, case.problem, case.rigidity, case.local)
+    energy = energies_of(load, case.problem, case.rigidity, case.local)
     least = energy.min()
     steps = int(np.flatnonzero(energy <= least * (1 + NEAR))[0])
     solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0, leave_saddles=False)
 
-    def run():
+    def of(problem):
         return jd.deform(
-            case.problem,
+            problem,
             load.targets,
             case.rigidity,
             local=case.local,
@@ -94,13 +98,13 @@ def _our_descent(load: Workload, case: Case) -> Ours:
             start=load.start,
         )
 
-    return Ours(run, (energy[: steps + 1] / least - 1).tolist())
+    return Ours(of, lambda: of(case.problem), (energy[: steps + 1] / least - 1).tolist())
 
 
 def _libigl_descent(load: Workload, problem: jd.Problem) -> tuple[list[int], list[float]]:
     """Return libigl's iterations until it is as near to the same minimum, and the energies."""
     local = jd.RotationFit()
-    least = float(_energies(load, problem, 0.0, local)[-1])
+    least = float(energies_of(load, problem, 0.0, local)[-1])
     data = load.libigl(5)
     p, steps = load.start, [0]
     energies = [load.reduced_energy(problem, p, 0.0, local) / least - 1]
@@ -111,7 +115,7 @@ def _libigl_descent(load: Workload, problem: jd.Problem) -> tuple[list[int], lis
     return steps, energies
 
 
-def _energies(load: Workload, problem: jd.Problem, rigidity: float, local: jd.LocalStep):
+def energies_of(load: Workload, problem: jd.Problem, rigidity: ArrayLike, local: jd.LocalStep):
     """Return the energy at the start and after each iteration, down to the minimum."""
     solver = jd.QuasiNewton(tolerance=1e-13, max_steps=3000)
     out = jd.deform(problem, load.targets, rigidity, local=local, solver=solver, start=load.start)
