@@ -30,6 +30,7 @@ from jaxdeform._deformation.system import System
 from jaxdeform._linalg.buckets import enlarge, fill_up
 from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
 from jaxdeform._linalg.ell import EllMatrix
+from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.lbfgs import has_converged
 from jaxdeform._linalg.rotations import rotation_matrices
 from jaxdeform._mesh.mesh import Mesh
@@ -181,8 +182,17 @@ def with_derivative_of_minimum(
         step, left = _conjugate_gradients(hessian, precondition, -error, _NEWTON_TOLERANCE)
         step = jnp.where(left <= _NEWTON_TOLERANCE, step, 0.0)
         p, t = known[0] + step[0], _turned(known[1], step[1])
+        zero = _at_rest(p)
 
-        zero, slope = _at_rest(p), _slope(energy, targets, p, t)
+        def newton(targets, p, t):
+            slope = _slope(energy, targets, p, t)(zero, targets)
+            step = _solve(*_hessian(energy, targets, p, t), -slope)
+            moved = jnp.where(energy.system.free[None], p + step[0], targets)
+            return moved, _turned(t, step[1])
+
+        # A Newton step of size 0, whose derivatives need no rule.
+        p, t = with_derivative_of(newton, (p, t), targets, p, t)
+        slope = _slope(energy, targets, p, t)
         _, right = jax.jvp(lambda targets: slope(zero, targets), (targets,), (tangents[1],))
         move = _solve(*_hessian(energy, targets, p, t), -right)
         moved = jnp.where(energy.system.free[None], move[0], tangents[1])

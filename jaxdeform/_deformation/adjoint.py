@@ -15,6 +15,7 @@ from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import InputError
 from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
+from jaxdeform._linalg.known_value import with_derivative_of
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,13 @@ class Implicit:
                 moved = jnp.where(system.free[None], free, inputs.targets)
                 return energy.evaluate(system, inputs, moved, transforms).gradient
 
+            def newton(p, inputs):
+                slope, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
+                step = self._solve_hessian(system, hessian, precondition, -slope)
+                return jnp.where(system.free[None], p + step, inputs.targets)
+
+            # A Newton step of size 0, whose derivatives need no rule.
+            p = with_derivative_of(newton, p, p, inputs)
             _, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
             _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
             move = self._solve_hessian(system, hessian, precondition, -right)

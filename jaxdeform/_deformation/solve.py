@@ -29,6 +29,7 @@ from jaxdeform._deformation.system import System
 from jaxdeform._deformation.verdict import inside_out, verdict
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.buckets import cut, fill_up
+from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, succeeded
@@ -304,8 +305,8 @@ def _with_derivatives_at_end(
             at = energy.evaluate(system, inputs, p, anchor.transforms)
             return at.transforms, at.energy
 
-        known = at_end(*primals)  # so that this rule has derivatives too
-        moved = tangents[1], tangents[2].positions
-        return known, jax.jvp(run, (inputs, anchor.positions), moved)[1]
+        at = inputs, anchor.positions
+        known = with_derivative_of(run, primals[3:], *at)  # so that this rule has derivatives too
+        return known, jax.jvp(run, at, (tangents[1], tangents[2].positions))[1]
 
     return at_end(system, inputs, anchor, transforms, value)
