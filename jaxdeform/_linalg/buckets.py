@@ -71,7 +71,10 @@ def cut(x: jax.Array, count: int, axis: int = -1) -> jax.Array:
 
 def enlarge(matrix: sp.spmatrix, size: int, blocks: int = 1) -> sp.csr_matrix:
     """Return a square sparse matrix with empty rows and columns added to each of its blocks."""
-    given = sp.coo_matrix(matrix)
+    given = sp.csr_matrix(matrix, copy=True)
     n = matrix.shape[0] // blocks
-    row, column = (x // n * size + x % n for x in (given.row, given.col))
-    return sp.csr_matrix((given.data, (row, column)), shape=(blocks * size, blocks * size))
+    length = np.zeros((blocks, size), given.indptr.dtype)
+    length[:, :n] = np.diff(given.indptr).reshape(blocks, n)
+    starts = np.concatenate([given.indptr[:1], np.cumsum(length, dtype=length.dtype)])
+    columns = given.indices + given.indices // max(n, 1) * (size - n)
+    return sp.csr_matrix((given.data, columns, starts), shape=(blocks * size, blocks * size))
