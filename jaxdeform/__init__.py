@@ -23,6 +23,7 @@ from jaxdeform._baselines.sr_arap import sr_arap
 from jaxdeform._deformation.adjoint import Implicit, Unrolled
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.batch import deform_batch, deform_in_chunks
+from jaxdeform._deformation.coarse import CoarseProblem, coarsen
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.local_step import (
     LBFGS,
@@ -70,6 +71,7 @@ __all__ = [
     "AffineFit",
     "Alternating",
     "Cells",
+    "CoarseProblem",
     "Discrepancy",
     "Estimate",
     "FieldEstimate",
@@ -99,6 +101,7 @@ __all__ = [
     "arap",
     "bend",
     "bounded_biharmonic_weights",
+    "coarsen",
     "cotangent_weights",
     "deform",
     "deform_batch",

@@ -25,9 +25,9 @@ WEIGHTS = {"vertices": MESH.vertices, "controls": TWO, "distances": np.ones((N, 
 # Results and protocols, which a user does not make; and what sets the whole process
 # (apps/test_compilation_cache.py).
 _NOT_CALLED = (
-    "Adjoint Cells Discrepancy Estimate FieldEstimate HandleFile InputError Inspection LocalStep "
-    "Problem Result RigidGroup Selection Skeleton Solution Solver ThesisEstimate Verdict "
-    "enable_compilation_cache"
+    "Adjoint Cells CoarseProblem Discrepancy Estimate FieldEstimate HandleFile InputError "
+    "Inspection LocalStep Problem Result RigidGroup Selection Skeleton Solution Solver "
+    "ThesisEstimate Verdict enable_compilation_cache"
 )
 NOT_CALLED = set(_NOT_CALLED.split())
 NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
@@ -138,6 +138,7 @@ def good_calls(folder: Path) -> dict:
             jd.bounded_biharmonic_weights,
             {"mesh": MESH, "handles": [0, 1, 2], "group": [0, 1, 0]},
         ),
+        "coarsen": (jd.coarsen, {"problem": problem, "n_vertices": 5}),
         "cotangent_weights": (jd.cotangent_weights, {"mesh": MESH}),
         "deform": (
             jd.deform,
@@ -317,7 +318,8 @@ OF_KIND = {
     "rigidity rotations start targets transforms translations vertices weights",
     "indices": "faces group parts r",
     "vertices": "free handles moved sources",
-    "count": "columns count history_length k memory max_evaluations max_steps steps width",
+    "count": "columns count history_length k memory max_evaluations max_steps n_vertices steps "
+    "width",
     "tolerance": "alpha determined_within distance radius seconds smoothness step_size "
     "target_noise threshold tolerance",
     "path": "path motion",

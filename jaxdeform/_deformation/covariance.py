@@ -31,6 +31,14 @@ class CovarianceMap(eqx.Module):
     backward: EllMatrix
     """K^T: three blocks beside each other."""
 
+    @staticmethod
+    def of(blocks: list[sp.csr_matrix], dtype: np.dtype) -> "CovarianceMap":
+        """Return K, given a block per axis."""
+        return CovarianceMap(
+            EllMatrix.build([[block] for block in blocks], dtype),
+            EllMatrix.build([[block.T.tocsr() for block in blocks]], dtype),
+        )
+
     def __call__(self, positions: Float[Array, "3 v"], batch: int = 1) -> Float[Array, "3 3 v"]:
         """Return C (rest axis, deformed axis, cell)."""
         x = split_batch(positions, batch)[:, None]
@@ -43,31 +51,25 @@ class CovarianceMap(eqx.Module):
         return out.reshape(3, -1)
 
 
-def covariance_map(
+def covariance_blocks(
     cells: Cells,
     vertices: Float[np.ndarray, "vertices 3"],
     principal_axes: Float[np.ndarray, "vertices 3 3"],
-    dtype: np.dtype,
-    size: int | None = None,
-) -> CovarianceMap:
-    """Return K for cells on these rest vertices, turned into their principal axes (columns).
+    size: int,
+) -> list[sp.csr_matrix]:
+    """Return K, a block per axis, for cells on these rest vertices in their principal axes.
 
-    With a size, empty cells fill it up to so many (buckets.py).
+    The axes are columns. Empty cells fill the blocks up to a size (buckets.py).
     """
-    size = size or cells.n_vertices
     (i, j), member = cells.edges.T, cells.membership
     pull = cells.weights[:, None] * (vertices[i] - vertices[j])
     # For each edge of each cell, its two ends: +pull and -pull.
     cell, edge = np.repeat(np.arange(cells.n_vertices), np.diff(member.indptr)), member.indices
     share = np.einsum("eac,ea->ce", principal_axes[cell], pull[edge] * member.data[:, None])
     rows, columns = np.tile(cell, 2), np.concatenate([i[edge], j[edge]])
-    blocks = [
+    return [
         sp.csr_matrix((np.concatenate([x, -x]), (rows, columns)), shape=(size, size)) for x in share
     ]
-    return CovarianceMap(
-        EllMatrix.build([[block] for block in blocks], dtype),
-        EllMatrix.build([[block.T.tocsr() for block in blocks]], dtype),
-    )
 
 
 def stiffness(cells: Cells) -> sp.csc_matrix:

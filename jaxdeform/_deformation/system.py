@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._deformation.covariance import CovarianceMap, covariance_map
+from jaxdeform._deformation.covariance import CovarianceMap, covariance_blocks
 from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
 from jaxdeform._handles.split import HandleSplit
 from jaxdeform._linalg.buckets import bucket, fill_up, next_of
@@ -78,7 +78,7 @@ def build_system(
         soft=put(fill_up(split.soft, size)),
         principal_moments=put(fill_up(moments.T, size)),
         principal_axes=put(all_axes),
-        covariance=covariance_map(cells, rest, axes, dtype, size),
+        covariance=CovarianceMap.of(covariance_blocks(cells, rest, axes, size), dtype),
         stiffness=EllMatrix.build([[matrix]], dtype),
         factor=factor,
         initial_guess=laplacian_guess(cells, led, dtype),

@@ -40,17 +40,17 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike) -> Float[np.ndarray, "ver
     """
     check_type("mesh", mesh, Mesh)
     index = check_handles(sources, mesh, name="source")
-    faces, every = manifold_faces(mesh), np.arange(mesh.n_vertices)
+    faces, every = manifold_faces(mesh, "geodesic distances need"), np.arange(mesh.n_vertices)
     each = [exact_distances(mesh, faces, index[[k]], every) for k in range(len(index))]
     return np.stack(each, axis=1)
 
 
-def manifold_faces(mesh: Mesh) -> Int[np.ndarray, "solid 3"]:
-    """Return the faces with an area, or raise InputError where libigl cannot walk on them."""
+def manifold_faces(mesh: Mesh, what: str) -> Int[np.ndarray, "solid 3"]:
+    """Return the faces with an area, or raise InputError: what is asked for needs a manifold."""
     faces = np.ascontiguousarray(mesh.solid_faces)
     used = np.unique(faces)
     if not (igl.is_edge_manifold(faces)[0] and np.ravel(igl.is_vertex_manifold(faces))[used].all()):
-        raise InputError("geodesic distances need a manifold surface: see jd.inspect(mesh)")
+        raise InputError(f"{what} a manifold surface: see jd.inspect(mesh)")
     return faces
 
 

@@ -27,7 +27,7 @@ def within_distance(
     mesh: Mesh, sources: Int[np.ndarray, "sources"], distance: float
 ) -> Bool[np.ndarray, "vertices"]:
     """Return whether each vertex is at most this far from its nearest source."""
-    faces = manifold_faces(mesh)
+    faces = manifold_faces(mesh, "geodesic distances need")
     points = (mesh.vertices - mesh.center) / mesh.diagonal
     path = _path_lengths(points, faces, sources)
     limit = distance / mesh.diagonal
