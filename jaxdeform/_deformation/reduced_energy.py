@@ -68,10 +68,12 @@ class ReducedEnergy:
             t = self._fit(transforms, c, moments, inputs.rigidity)
             cells = self.local.energy(t, c, moments, inputs.rigidity)
         else:
-            # B enters a law as T B only, so its change acts like one of C.
-            change = at.moment_change()
-            push = jnp.einsum("jik,lik->jlk", change, jax.lax.stop_gradient(transforms))
-            t = self._fit(transforms, c - push, moments, inputs.rigidity)
+            # B enters a law as T B only, so its change acts like one of C. The change is 0 in
+            # value, so T is right to one order more each time: twice for second derivatives.
+            change, t = at.moment_change(), transforms
+            for _ in range(2):
+                push = jnp.einsum("jik,lik->jlk", change, t)
+                t = self._fit(transforms, c - push, moments, inputs.rigidity)
             cells = self.local.energy(t, c, moments, inputs.rigidity)
             cells += jnp.einsum("ijk,jlk,ilk->k", t, change, t)
         # The factor holds the system's own weights of soft handles. Other weights enter here only.

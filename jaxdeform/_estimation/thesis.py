@@ -61,7 +61,7 @@ def estimate_rigidity_thesis(
         >>> problem = jd.precompute(mesh, [0, 1, 2, 6, 7, 8])
         >>> targets = jd.twist(mesh.vertices[problem.handles], 60.0, along="y")
         >>> pose = jd.deform(problem, targets, 0.5).vertices
-        >>> bool(jd.estimate_rigidity_thesis(problem, pose).rigidity < 0.4)
+        >>> bool(jd.estimate_rigidity_thesis(problem, pose, threshold=0.01).rigidity < 0.4)
         True
     """
     poses = check_poses(problem, observed, targets, None)

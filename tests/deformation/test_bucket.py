@@ -46,19 +46,10 @@ def plain(mesh):
     return out.vertices, out.transforms, out.energy[out.steps], out.flipped
 
 
-def field_of_rigidity(mesh):
-    problem, targets = setting(mesh, cells=jd.rings(mesh, 2))
-    return jd.deform(problem, targets, 0.1 + 0.05 * mesh.vertices[:, 1]).vertices
-
-
-def given_start(mesh):
-    problem, targets = setting(mesh)
-    return jd.deform(problem, targets, 1.0, start=1.01 * mesh.vertices).vertices
-
-
-def soft_handles(mesh):
-    problem, targets = setting(mesh, handle_weights=2.0)
-    return jd.deform(problem, targets, 1.0, handle_weights=1.5).vertices
+def field_and_start_and_soft_handles(mesh):
+    problem, targets = setting(mesh, cells=jd.rings(mesh, 2), handle_weights=2.0)
+    field, start = 0.1 + 0.05 * mesh.vertices[:, 1], 1.01 * mesh.vertices
+    return jd.deform(problem, targets, field, start=start, handle_weights=1.5).vertices
 
 
 def with_normals(mesh):
@@ -92,12 +83,6 @@ def gradient_to_rest(mesh):
         return jnp.sum(jd.deform(problem, targets, 0.5, rest=rest).vertices[:, 1] ** 2)
 
     return jax.grad(height)(jnp.asarray(mesh.vertices))
-
-
-def under_vmap(mesh):
-    problem, targets = setting(mesh)
-    lam = jnp.asarray([0.1, 1.0, 10.0])
-    return jax.vmap(lambda lam: jd.deform(problem, targets, lam).vertices)(lam)
 
 
 def in_a_batch(mesh):
@@ -168,13 +153,10 @@ def estimate_of_observed_handles(mesh):
 
 QUICK = [plain, with_normals, editing, constants, minimality_and_energy]
 SLOW = [
-    field_of_rigidity,
-    given_start,
-    soft_handles,
+    field_and_start_and_soft_handles,
     gradient,
     unrolled_gradient,
     gradient_to_rest,
-    under_vmap,
     in_a_batch,
     along_a_path,
     submesh,
@@ -185,7 +167,7 @@ SLOW = [
 CALLS = [*QUICK, *(pytest.param(call, marks=pytest.mark.slow) for call in SLOW)]
 
 
-TRACED = [gradient, unrolled_gradient, under_vmap]
+TRACED = [gradient, unrolled_gradient]
 
 
 @pytest.fixture(scope="module")

@@ -82,6 +82,38 @@ def test_derivatives_to_the_edge_weights(case):
     np.testing.assert_allclose(jnp.sum(jax.grad(loss)(jnp.asarray(w)) * direction), want, rtol=FD)
 
 
+@pytest.mark.slow
+def test_second_derivatives_to_the_rest_shape(case):
+    """Twice along a direction, and along it and to the rigidity: forward over forward."""
+    mesh, handles, targets, _, weight, direction = case
+    settings = {"solver": jd.QuasiNewton(tolerance=1e-16, max_steps=2000)}
+    problem = jd.precompute(mesh, handles)
+    near = jd.deform(problem, targets, 0.7, **settings).vertices
+
+    def whole(s, u):
+        moved = jd.precompute(jd.Mesh(mesh.vertices + s * direction, mesh.faces), handles)
+        return value(jd.deform(moved, targets, 0.7 * np.exp(u), start=near, **settings), weight)
+
+    h = 1e-2
+    f = {k: float(whole(k * h, 0.0)) for k in range(-2, 3)}
+    twice = (16 * (f[1] + f[-1]) - f[2] - f[-2] - 30 * f[0]) / (12 * h**2)
+    corners = [i * j * whole(i * h, j * h) for i in (-1, 1) for j in (-1, 1)]
+    mixed = float(sum(corners)) / (4 * h**2)
+
+    def loss(x):
+        rest = jnp.asarray(mesh.vertices) + x[0] * direction
+        return value(
+            jd.deform(problem, targets, 0.7 * jnp.exp(x[1]), rest=rest, start=near), weight
+        )
+
+    def along(x):
+        return jax.jvp(loss, (x,), (jnp.array([1.0, 0.0]),))[1]
+
+    got = jax.jit(jax.jacfwd(along))(jnp.zeros(2))
+    np.testing.assert_allclose(got[0], twice, rtol=2e-3)
+    np.testing.assert_allclose(got[1], mixed, rtol=1e-2)  # the difference is of second order
+
+
 def test_another_rest_shape_is_refused_and_said_inside_jit(case):
     mesh, handles, targets, *_ = case
     problem = jd.precompute(mesh, handles)

@@ -127,10 +127,11 @@ def test_intervals_cover_the_truth(
 def test_measured_targets_must_be_called_so(bar, bar_problem, equilibrium_of):
     """Measured handles, given as exact, make the interval too narrow; as noisy, it covers.
 
-    The errors, in standard errors, should have a mean square of 1: of 12 seeds, 2 has p = 0.02.
+    The errors, in standard errors, should have a mean square of 1: it is 6 with these. Of 8
+    intervals of 95 %, five or fewer cover in 0.6 % of all draws.
     """
     pose, square, hits = equilibrium_of(20.0), 0.0, 0
-    for seed in range(12):
+    for seed in range(8):
         seen = noisy(bar, pose, seed)
         exact, measured = (
             jd.estimate_rigidity(
@@ -139,10 +140,10 @@ def test_measured_targets_must_be_called_so(bar, bar_problem, equilibrium_of):
             for noise in (0.0, 1.0)
         )
         low, high = exact.interval[0]
-        square += (np.log(exact.rigidity[0] / 20.0) / (np.log(high / low) / (2 * 1.96))) ** 2 / 12
+        square += (np.log(exact.rigidity[0] / 20.0) / (np.log(high / low) / (2 * 1.96))) ** 2 / 8
         hits += measured.interval[0, 0] <= 20.0 <= measured.interval[0, 1]
     assert square > 2.0
-    assert hits >= 11
+    assert hits >= 6
 
 
 # ---------------------------------------------------------------- misuse
