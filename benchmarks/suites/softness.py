@@ -1,6 +1,7 @@
 """Evaluations by rigidity, with A as the first inverse Hessian and with the metric of the material.
 
-Also what telling a minimum from a saddle costs, beside the deformation.
+Also what telling a minimum from a saddle costs, and what a coarse start saves, beside the
+deformation.
 """
 
 import numpy as np
@@ -28,6 +29,9 @@ def run(quick: bool) -> Findings:
                 out += _evaluations(load, problem, constant, target)
     for load in loads[:3]:
         out.append(_cost_of_telling(load))
+    for load in loads[1:5]:
+        for constant in (10.0, 0.2):
+            out += _coarse_start(load, constant)
     return Findings(out)
 
 
@@ -69,3 +73,31 @@ def _cost_of_telling(load: Workload) -> Metric:
     seconds = interleaved(runs, 7)
     name = "telling a minimum from a saddle / the deformation"
     return Metric(name, load.name, seconds["True"] / seconds["False"] - 1.0, "1", 0.25)
+
+
+def _coarse_start(load: Workload, constant: float) -> list[Metric]:
+    """Descend to 1e-4 of the minimum from a coarse start, which counts, and from the usual one."""
+    problem = jd.precompute(load.mesh, load.handles)
+    rigidity, coarse = jd.rigidity_from_material(problem, constant), jd.coarsen(problem)
+
+    def descend(from_coarse: bool, most: int, tolerance: float = 1e-9) -> jd.Solution:
+        start = coarse.start(load.targets, rigidity) if from_coarse else None
+        solver = jd.QuasiNewton(tolerance, most, leave_saddles=False)
+        return jd.deform(problem, load.targets, rigidity, start=start, solver=solver)
+
+    energy = {x: np.asarray(descend(x, 2000).energy) for x in (True, False)}
+    steps = {x: int(np.argmax(e <= e[-1] * (1 + NEAR))) for x, e in energy.items()}
+    runs = {
+        str(x): lambda x=x: descend(x, max(steps[x], 1), 0.0).vertices.block_until_ready()
+        for x in (True, False)
+    }
+    seconds = interleaved(runs, 5)
+    where = f"{load.name}, constant {constant:g}"
+    end = float(energy[True][-1] / energy[False][-1])
+    ratio = seconds["True"] / seconds["False"]
+    return [
+        Metric(f"evaluations to {NEAR:g}, coarse start", where, steps[True], "evaluations"),
+        Metric(f"evaluations to {NEAR:g}, usual start", where, steps[False], "evaluations"),
+        Metric("time with a coarse start / without", where, ratio, "1"),
+        Metric("energy reached with a coarse start / without", where, end, "1"),
+    ]

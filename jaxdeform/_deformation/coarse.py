@@ -98,7 +98,7 @@ def coarsen(problem: Problem, n_vertices: int = 2000) -> CoarseProblem:
     """Make a coarser problem of the same surface, for starts close to the minimum.
 
     Where materials are stiff and meshes fine, most of a deformation is spent on the way through
-    large bends, which a coarse mesh goes as well: docs/performance.md has what it saves. Meshes
+    large bends, which a coarse mesh goes as well: docs/paths.md has what it saves. Meshes
     that bend in many places have many minima, and this start may lead to another one than
     Laplacian editing does, with a lower energy or a higher one.
 
