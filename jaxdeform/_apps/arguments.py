@@ -45,7 +45,7 @@ def read_parts(path: Path, mesh: jd.Mesh) -> np.ndarray:
                 "counted from 0 without gaps"
             )
     try:
-        return check_parts(values, mesh.n_vertices)
+        return check_parts(values, mesh)
     except jd.InputError as error:
         raise jd.InputError(f"{path}: {error}") from error
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxdeform._arrays import read_numbers
 from jaxdeform._checks import check_count, check_function, check_labels, check_tolerance
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
@@ -28,7 +27,8 @@ from jaxdeform._estimation.poses import check_poses, same_length, without
 from jaxdeform._estimation.search import search
 from jaxdeform._estimation.smooth_modes import smooth_modes
 from jaxdeform._estimation.verdict import Verdict, in_words
-from jaxdeform._mesh.selection import Selection
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.selection import read_mask_or_numbers
 from jaxdeform._result import Result, succeeded
 
 # Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
@@ -197,8 +197,8 @@ def estimate_rigidity(
     noise = float(targets is None) if target_noise is None else target_noise
     check_tolerance("target_noise", noise)
     poses = check_poses(problem, observed, targets, mask)
-    n = problem.n_vertices
-    label = check_parts(np.zeros(n, int) if parts is None else parts, n)
+    everywhere = np.zeros(problem.n_vertices, int)
+    label = check_parts(everywhere if parts is None else parts, problem.mesh)
     model = PartModel.build(problem, poses, label, solver, adjoint)
     found = _Search(model, noise, max_evaluations, progress).run(model.start(start))
     return _judge(found, poses.counted, max(determined_within, 1.0))
@@ -320,9 +320,9 @@ def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
     )
 
 
-def check_parts(parts: ArrayLike, n: int) -> Int[np.ndarray, "vertices"]:
+def check_parts(parts: ArrayLike, mesh: Mesh) -> Int[np.ndarray, "vertices"]:
     """Return the part of each vertex, or raise InputError naming what is wrong."""
-    given = parts.mask if isinstance(parts, Selection) else read_numbers(parts, "parts")
+    given, n = read_mask_or_numbers("parts", parts, mesh), mesh.n_vertices
     label = given.astype(int) if given.dtype == bool else given
     label = check_labels("parts", label, n, "vertex", n)
     missing = np.setdiff1d(np.arange(label.max() + 1), label)

@@ -5,13 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxdeform._arrays import read_host_array, read_numbers
+from jaxdeform._arrays import read_host_array
 from jaxdeform._baselines.laplacian_editing import laplacian_editing
 from jaxdeform._checks import check_rigidity, read_positions
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._errors import InputError
 from jaxdeform._estimation.resemblance import check_resemblance
-from jaxdeform._mesh.selection import Selection
+from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.selection import read_mask_or_numbers
 
 # Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.
@@ -58,7 +59,7 @@ def check_poses(problem: Any, observed: Any, targets: Any, mask: Any) -> Poses:
     """Return the poses, or raise InputError naming what is wrong."""
     check_problem(problem)
     given = read_poses("observed", observed, problem.n_vertices, problem.dtype)
-    seen = _check_mask(mask, *given.shape[:2])
+    seen = _check_mask(mask, len(given), problem.mesh)
     bad = np.argwhere(seen & ~np.isfinite(given).all(axis=2))
     if len(bad):
         pose, vertex = bad[0]
@@ -104,10 +105,9 @@ def read_poses(
     return poses
 
 
-def _check_mask(mask: Any, poses: int, n: int) -> Bool[np.ndarray, "poses vertices"]:
-    if mask is None:
-        mask = np.ones(n, bool)
-    seen = mask.mask if isinstance(mask, Selection) else read_numbers(mask, "mask")
+def _check_mask(mask: Any, poses: int, mesh: Mesh) -> Bool[np.ndarray, "poses vertices"]:
+    n = mesh.n_vertices
+    seen = read_mask_or_numbers("mask", np.ones(n, bool) if mask is None else mask, mesh)
     if seen.dtype != bool or seen.shape not in ((n,), (poses, n)):
         raise InputError(
             f"mask has shape {seen.shape} and type {seen.dtype}: give booleans ({n},) or "

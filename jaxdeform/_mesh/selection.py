@@ -22,7 +22,8 @@ class Selection:
 
     A selection stands wherever a function takes vertex indices, and as an index of NumPy's arrays:
     ``mesh.vertices[selection]``. (JAX's take ``selection.vertices``.) Its vertices are in ascending
-    order. It is a value: two selections of the same vertices of equal meshes are equal.
+    order. It may be of a mesh with the same faces and other positions, such as the rest shape of a
+    pose. It is a value: two selections of the same vertices of equal meshes are equal.
 
     **Fields**
 
@@ -117,11 +118,7 @@ def read_vertices(
     """
     n = mesh.n_vertices
     if isinstance(value, Selection):
-        if value.mesh.n_vertices != n:
-            raise InputError(
-                f"{name}: the selection is of another mesh ({value.mesh}, not {mesh}): select on "
-                "this one"
-            )
+        check_same_faces(name, value, mesh)
         return value.vertices
     given = read_numbers(value, name)
     if given.dtype == bool:
@@ -139,6 +136,28 @@ def read_vertices(
         )
     check_index(unit, given, n)
     return given
+
+
+def check_same_faces(name: str, selection: Selection, mesh: Mesh) -> None:
+    """Raise InputError unless the selection is of this mesh, or of the same faces elsewhere."""
+    other = selection.mesh
+    if other.faces is mesh.faces:
+        return
+    same_size = other.n_vertices == mesh.n_vertices
+    if same_size and np.array_equal(other.faces, mesh.faces):
+        return
+    what = f"{other}, not {mesh}"
+    if same_size and other.n_faces == mesh.n_faces:
+        what = "its faces name other vertices"
+    raise InputError(f"{name}: the selection is of another mesh ({what}): select on this one")
+
+
+def read_mask_or_numbers(name: str, value: ArrayLike, mesh: Mesh) -> np.ndarray:
+    """Return the mask of a selection, or the array that is given instead of one."""
+    if isinstance(value, Selection):
+        check_same_faces(name, value, mesh)
+        return value.mask
+    return read_numbers(value, name)
 
 
 def read_mask(

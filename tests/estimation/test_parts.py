@@ -189,14 +189,16 @@ def test_misuse_is_told_at_once(bar, bar_problem):
 def test_selections_and_masks_stand_for_parts_and_for_what_was_seen(bar, bar_problem, halves):
     upper = jd.select.mask(bar, halves == 1)
     for parts in (upper, halves == 1, (halves == 1).tolist()):
-        np.testing.assert_array_equal(check_parts(parts, 722), halves)
+        np.testing.assert_array_equal(check_parts(parts, bar), halves)
     wanted = check_poses(bar_problem, bar.vertices, bar.vertices[bar_problem.handles], halves == 1)
     found = check_poses(bar_problem, bar.vertices, bar.vertices[bar_problem.handles], upper)
     np.testing.assert_array_equal(found.counted, wanted.counted)
     with pytest.raises(jd.InputError, match="no vertex belongs to part 0"):
-        check_parts(upper | ~upper, 722)
-    other = jd.select.border(jd.shapes.square())
-    with pytest.raises(jd.InputError, match=r"parts have shape \(9,\)"):
-        check_parts(other, 722)
-    with pytest.raises(jd.InputError, match=r"mask has shape \(9,\).*a jd.Selection of this mesh"):
+        check_parts(upper | ~upper, bar)
+    other = jd.select.where(jd.Mesh(bar.vertices, bar.faces[::-1]), "y < 6")
+    with pytest.raises(jd.InputError, match="parts: the selection is of another mesh"):
+        check_parts(other, bar)
+    with pytest.raises(jd.InputError, match="mask: the selection is of another mesh"):
         check_poses(bar_problem, bar.vertices, None, other)
+    with pytest.raises(jd.InputError, match=r"mask has shape \(9,\).*a jd.Selection of this mesh"):
+        check_poses(bar_problem, bar.vertices, None, np.ones(9, bool))

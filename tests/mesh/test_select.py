@@ -181,6 +181,34 @@ def test_sets(bar):
         one & jd.select.border(CUBE)
 
 
+@pytest.mark.parametrize(
+    ("name", "use"),
+    [
+        ("handles", jd.precompute),
+        ("free", jd.submesh),
+        ("sources", jd.geodesic_distances),
+        ("sources", lambda mesh, chosen: jd.select.within(mesh, chosen, 0.1)),
+        ("handles", jd.bounded_biharmonic_weights),
+        ("the other side", lambda mesh, chosen: jd.select.where(mesh, "x < 0") | chosen),
+        ("the other side", lambda mesh, chosen: chosen | jd.select.where(mesh, "x < 0")),
+    ],
+)
+def test_a_selection_fits_its_faces_and_no_others(name, use):
+    """The square again, with its vertices in another order; and in a pose."""
+    mesh = jd.shapes.square()
+    order = np.random.default_rng(0).permutation(9)
+    renumbered = jd.Mesh(mesh.vertices[order], np.argsort(order)[mesh.faces])
+    chosen = jd.select.where(mesh, "x > 0")
+    assert chosen.vertices.tolist() != jd.select.where(renumbered, "x > 0").vertices.tolist()
+    message = f"{name}: the selection is of another mesh .its faces name other vertices"
+    with pytest.raises(jd.InputError, match=message):
+        use(renumbered, chosen)
+    pose = jd.Mesh(mesh.vertices @ np.diag([2.0, 1.0, 1.0]) + 5.0, mesh.faces.copy())
+    use(pose, chosen)
+    pair = jd.select.mask(pose, np.arange(9) < 2) | chosen
+    assert list(pair) == sorted({0, 1, *chosen})
+
+
 def test_a_selection_is_a_value(bar):
     mask = bar.vertices[:, 1] < 6
     one = jd.select.mask(bar, mask)
