@@ -81,6 +81,12 @@ def read_integers(
     return given.astype(np.int64)
 
 
+def read_only(array: np.ndarray) -> np.ndarray:
+    """Return the array, which cannot be written any more."""
+    array.setflags(write=False)
+    return array
+
+
 def float_type(value: ArrayLike) -> np.dtype:
     """Return the type to compute in: the value's own up to 32 bits, else that of JAX's floats."""
     given = getattr(value, "dtype", None)

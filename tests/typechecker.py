@@ -15,7 +15,7 @@ PUBLIC |= {"bar", "cactus", "cylinder", "octopus", "square"}  # jd.shapes
 PUBLIC |= {"border", "box", "component", "halfspace", "mask", "nearest", "sphere"}  # jd.select
 PUBLIC |= {"where", "within"}
 SETTINGS = {"Alternating", "GradientDescent", "Implicit", "LBFGS", "Newton", "QuasiNewton"}
-PUBLIC |= {f"{name}.__init__" for name in {"Mesh", *SETTINGS}}
+PUBLIC |= {f"{name}.__init__" for name in {"Cells", "Mesh", "Selection", *SETTINGS}}
 
 
 def check(function):

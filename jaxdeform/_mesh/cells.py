@@ -2,35 +2,53 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-from jaxdeform._arrays import read_host_array, read_integers
+from jaxdeform._arrays import read_host_array, read_integers, read_only
 from jaxdeform._checks import check_type
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, a_or_an
 from jaxdeform._mesh.laplacian import cotangent_weights
 from jaxdeform._mesh.mesh import Mesh, content_digest
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Cells:
     """One cell per vertex: the edges that the transformation of this vertex has to fit.
 
-    Made by `rings` and `spokes`. Like the mesh, cells are a value: equal content makes
-    them equal, in every process.
+    `rings` and `spokes` make them. Like the mesh, cells are a value: equal content makes them
+    equal, in every process. The arrays are read-only: copy one before you change it.
 
-    **Fields**
+    **Arguments**, which are also the fields
 
     - mesh: the rest shape that the cells belong to.
-    - weights: (edges,) one weight per row of ``mesh.edges``; cotangent weights by default.
-    - membership: (vertices, edges) 1 where the edge belongs to the cell of the vertex.
+    - weights: (edges,) one finite weight per row of ``mesh.edges``.
+    - membership: (vertices, edges), sparse: 1 where the edge belongs to the cell of the vertex.
+
+    **Raises** InputError: the weights are not finite or of the wrong length; the membership is not
+    sparse, of the wrong shape, or holds other numbers than 0 and 1.
     """
 
     mesh: Mesh
     weights: Float[np.ndarray, "edges"]
     membership: sp.csr_matrix
+
+    def __init__(self, mesh: Mesh, weights: ArrayLike, membership: Any) -> None:
+        """Check, copy and freeze the arrays."""
+        check_type("mesh", mesh, Mesh)
+        member = _read_membership(mesh, membership)
+        for array in (member.data, member.indices, member.indptr):
+            read_only(array)
+        object.__setattr__(self, "mesh", mesh)
+        object.__setattr__(self, "weights", read_only(_read_weights(mesh, weights)))
+        object.__setattr__(self, "membership", member)
+
+    def __reduce__(self):
+        """Pickle the content; loading checks and freezes it again."""
+        return Cells, (self.mesh, self.weights, self.membership)
 
     @property
     def edges(self) -> Int[np.ndarray, "edges 2"]:
@@ -133,7 +151,7 @@ def rings(mesh: Mesh, r: ArrayLike = 1, *, weights: ArrayLike | None = None) -> 
     ends.data = (ends.data == 2).astype(np.int8)
     ends.eliminate_zeros()
     ends.sort_indices()
-    return Cells(mesh, _weights(mesh, weights), ends)
+    return Cells(mesh, cotangent_weights(mesh) if weights is None else weights, ends)
 
 
 def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
@@ -158,7 +176,8 @@ def spokes(mesh: Mesh, *, weights: ArrayLike | None = None) -> Cells:
         Cells(722 cells, 2160 edges, 6.0 edges per cell)
     """
     check_type("mesh", mesh, Mesh)
-    return Cells(mesh, _weights(mesh, weights), _incidence(mesh))
+    given = cotangent_weights(mesh) if weights is None else weights
+    return Cells(mesh, given, _incidence(mesh))
 
 
 def principal_moments(
@@ -191,9 +210,8 @@ def _incidence(mesh: Mesh) -> sp.csr_matrix:
     return matrix
 
 
-def _weights(mesh: Mesh, weights: ArrayLike | None) -> Float[np.ndarray, "edges"]:
-    if weights is None:
-        return cotangent_weights(mesh)
+def _read_weights(mesh: Mesh, weights: ArrayLike) -> Float[np.ndarray, "edges"]:
+    """Return a copy of the weights, or raise InputError."""
     given = read_host_array(weights, np.float64, "weights")
     if given.shape != (len(mesh.edges),):
         raise InputError(
@@ -203,4 +221,28 @@ def _weights(mesh: Mesh, weights: ArrayLike | None) -> Float[np.ndarray, "edges"
     if not np.isfinite(given).all():
         bad = int(np.flatnonzero(~np.isfinite(given))[0])
         raise InputError(f"the weight of edge {bad} is {given[bad]}: weights must be finite")
-    return given
+    return given.copy()
+
+
+def _read_membership(mesh: Mesh, membership: Any) -> sp.csr_matrix:
+    """Return a copy with ones in ascending order, or raise InputError."""
+    if not sp.issparse(membership):
+        raise InputError(
+            f"membership is {a_or_an(membership)}: give a sparse matrix of SciPy, as "
+            "jd.rings(mesh).membership"
+        )
+    shape = mesh.n_vertices, len(mesh.edges)
+    if membership.shape != shape:
+        raise InputError(
+            f"membership has shape {membership.shape}: give (vertices, edges), {shape}"
+        )
+    member = sp.csr_matrix(membership, copy=True)
+    member.sum_duplicates()
+    member.eliminate_zeros()
+    if not (member.data == 1).all():
+        vertex = int(np.searchsorted(member.indptr, np.argmax(member.data != 1), "right")) - 1
+        raise InputError(
+            f"the membership of cell {vertex} holds {member.data[member.data != 1][0]}: give 1 "
+            "where the edge belongs to the cell, and nothing elsewhere"
+        )
+    return sp.csr_matrix(member, dtype=np.int8)

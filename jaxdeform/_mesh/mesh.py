@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from jaxdeform._arrays import read_host_array, read_integers
+from jaxdeform._arrays import read_host_array, read_integers, read_only
 from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.grouping import distinct
@@ -91,8 +91,7 @@ class Mesh:
                 )
         solid = np.delete(faces, [face for _, face in bad], axis=0) if bad else faces
         for name, array in (("vertices", vertices), ("faces", faces), ("solid_faces", solid)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(array))
         object.__setattr__(self, "source", source)
 
     @property
@@ -108,19 +107,19 @@ class Mesh:
     @cached_property
     def edges(self) -> Int[np.ndarray, "edges 2"]:
         """Undirected edges (i < j) of faces with an area, each once, in ascending order."""
-        return unique_edges(self.solid_faces)
+        return read_only(unique_edges(self.solid_faces))
 
     @cached_property
     def referenced(self) -> Bool[np.ndarray, "vertices"]:
         """True for each vertex that belongs to a face with an area."""
         mask = np.zeros(self.n_vertices, bool)
         mask[self.solid_faces.ravel()] = True
-        return mask
+        return read_only(mask)
 
     @cached_property
     def components(self) -> Int[np.ndarray, "vertices"]:
         """Connected component of each vertex, numbered from 0."""
-        return connected_components(self.edges, self.n_vertices)
+        return read_only(connected_components(self.edges, self.n_vertices))
 
     @property
     def diagonal(self) -> float:
@@ -130,7 +129,7 @@ class Mesh:
     @cached_property
     def center(self) -> Float[np.ndarray, "3"]:
         """Mean of the referenced vertices."""
-        return self.vertices[self.referenced].mean(axis=0)
+        return read_only(self.vertices[self.referenced].mean(axis=0))
 
     @cached_property
     def digest(self) -> bytes:

@@ -5,7 +5,7 @@ Each function returns a `Selection`, which ``|``, ``&``, ``-`` and ``~`` combine
 
 import numpy as np
 
-from jaxdeform._arrays import read_host_array, read_numbers
+from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_count, check_tolerance, check_type, read_axis
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._mesh.expressions import matching
@@ -239,14 +239,7 @@ def mask(mesh: Mesh, mask: ArrayLike) -> Selection:
         >>> jd.select.mask(mesh, mesh.vertices[:, 1] < 6)
         Selection(73 of 722 vertices)
     """
-    check_type("mesh", mesh, Mesh)
-    given = read_numbers(mask, "mask")
-    if given.dtype != bool or given.shape != (mesh.n_vertices,):
-        raise InputError(
-            f"mask has shape {given.shape} and type {given.dtype}: give booleans "
-            f"({mesh.n_vertices},)"
-        )
-    return Selection(mesh, given.copy())
+    return Selection(mesh, mask)
 
 
 def some_where(mesh: Mesh, expression: object, name: str) -> Selection:

@@ -7,15 +7,15 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxdeform._arrays import read_integers, read_numbers
-from jaxdeform._checks import check_index
+from jaxdeform._arrays import read_integers, read_numbers, read_only
+from jaxdeform._checks import check_index, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Selection:
-    """A set of vertices of one mesh. Made by the functions of ``jd.select``.
+    """A set of vertices of one mesh. The functions of ``jd.select`` make them.
 
     ``a | b`` has the vertices of either, ``a & b`` of both, ``a - b`` of a only, and ``~a`` all
     others. The other side may also be a mask (vertices,) or a list of vertex indices.
@@ -24,6 +24,10 @@ class Selection:
     ``mesh.vertices[selection]``. (JAX's take ``selection.vertices``.) Its vertices are in ascending
     order. It may be of a mesh with the same faces and other positions, such as the rest shape of a
     pose. It is a value: two selections of the same vertices of equal meshes are equal.
+
+    **Arguments**: mesh; mask, booleans (vertices,).
+
+    **Raises** InputError: a mask of another shape, or of values that are not booleans.
 
     **Fields**
 
@@ -47,14 +51,26 @@ class Selection:
     # Else NumPy would work on the indices in ``mask & selection``, instead of asking __rand__.
     __array_ufunc__ = None
 
-    def __post_init__(self) -> None:
-        """Freeze the mask."""
-        self.mask.setflags(write=False)
+    def __init__(self, mesh: Mesh, mask: ArrayLike) -> None:
+        """Check the mask, copy and freeze it."""
+        check_type("mesh", mesh, Mesh)
+        given = read_numbers(mask, "mask")
+        if given.dtype != bool or given.shape != (mesh.n_vertices,):
+            raise InputError(
+                f"mask has shape {given.shape} and type {given.dtype}: give booleans "
+                f"({mesh.n_vertices},)"
+            )
+        object.__setattr__(self, "mesh", mesh)
+        object.__setattr__(self, "mask", read_only(given.copy()))
+
+    def __reduce__(self):
+        """Pickle the mesh and the mask; loading checks and freezes them again."""
+        return Selection, (self.mesh, self.mask)
 
     @cached_property
     def vertices(self) -> Int[np.ndarray, "chosen"]:
         """Indices of the vertices, in ascending order."""
-        return np.flatnonzero(self.mask)
+        return read_only(np.flatnonzero(self.mask))
 
     def __len__(self) -> int:
         """Return the number of vertices of the selection."""

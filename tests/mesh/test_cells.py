@@ -1,7 +1,11 @@
 """Cells: what test_energy.py does not show of them on small meshes, and misuse."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
+from helpers import replaced
 
 import jaxdeform as jd
 
@@ -54,6 +58,68 @@ def test_given_weights_are_kept():
     weights = np.linspace(-1, 1, len(mesh.edges))
     for cells in (jd.rings(mesh, 1, weights=weights), jd.spokes(mesh, weights=weights)):
         np.testing.assert_array_equal(cells.weights, weights)
+
+
+def made_by_hand(mesh):
+    cells = jd.spokes(mesh, weights=np.ones(len(mesh.edges)))
+    return jd.Cells(mesh, np.ones(len(mesh.edges)), cells.membership.astype(float).tocoo())
+
+
+@pytest.mark.parametrize("make", [lambda mesh: jd.rings(mesh, 2), jd.spokes, made_by_hand])
+def test_cells_are_a_value_that_cannot_be_written(make):
+    cells = make(bipyramid(6))
+    for one in (cells, pickle.loads(pickle.dumps(cells)), copy.deepcopy(cells), copy.copy(cells)):
+        assert one == make(bipyramid(6))
+        member = one.membership
+        for array in (one.weights, member.data, member.indices, member.indptr):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 3
+        with pytest.raises(ValueError, match="read-only"):
+            member[0, 0] = 0
+        np.testing.assert_array_equal(member.toarray(), make(bipyramid(6)).membership.toarray())
+
+
+def test_the_caller_s_weights_and_membership_are_copied():
+    mesh = bipyramid(6)
+    weights = np.linspace(-1, 1, 18)
+    member = jd.spokes(mesh).membership.copy()
+    by_rings, by_hand = jd.rings(mesh, weights=weights), jd.Cells(mesh, weights, member)
+    weights[0] = 7
+    member.data[0] = 0
+    for cells in (by_rings, by_hand):
+        np.testing.assert_array_equal(cells.weights, np.linspace(-1, 1, 18))
+    assert (by_hand.membership != jd.spokes(mesh).membership).nnz == 0
+
+
+def test_cells_made_by_hand_are_those_of_spokes():
+    mesh = bipyramid(6)
+    weights = np.ones(18)
+    assert made_by_hand(mesh) == jd.spokes(mesh, weights=weights)
+    # Zeros that are stored are no members.
+    member = jd.spokes(mesh).membership.copy()
+    kept = member.nnz - np.diff(member.indptr)[2]
+    member.data[member.indptr[2] : member.indptr[3]] = 0
+    assert jd.Cells(mesh, weights, member).overlap.sum() == kept
+
+
+def test_cells_made_by_hand_are_checked():
+    mesh = bipyramid(6)
+    weights, member = jd.spokes(mesh).weights, jd.spokes(mesh).membership
+    twice = member.copy()
+    twice.data[twice.indptr[5]] = 2
+    bad = {
+        "mesh is a ndarray: give a jd.Mesh": (mesh.vertices, weights, member),
+        "weights cannot be read as numbers: it is None": (mesh, None, member),
+        r"weights have shape \(8,\): give one per row of": (mesh, np.ones(8), member),
+        "the weight of edge 2 is inf": (mesh, replaced(weights, 2, np.inf), member),
+        "membership is a ndarray: give a sparse matrix": (mesh, weights, member.toarray()),
+        "membership is None: give a sparse": (mesh, weights, None),
+        r"membership has shape \(18, 8\): give .*\(8, 18\)": (mesh, weights, member.T),
+        "the membership of cell 5 holds 2: give 1": (mesh, weights, twice),
+    }
+    for message, arguments in bad.items():
+        with pytest.raises(jd.InputError, match=message):
+            jd.Cells(*arguments)
 
 
 def test_bad_arguments_are_named():

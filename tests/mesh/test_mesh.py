@@ -1,5 +1,8 @@
 """Meshes: what is refused, copied, frozen and derived."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from helpers import replaced, tetrahedron
@@ -51,6 +54,16 @@ def test_the_caller_s_arrays_are_copied_and_the_mesh_s_are_frozen():
         mesh.vertices[0] = 1
     with pytest.raises(AttributeError):
         mesh.faces = f
+
+
+@pytest.mark.parametrize("name", ["edges", "referenced", "components", "center"])
+def test_what_is_derived_of_a_mesh_is_frozen_too(name):
+    mesh = jd.Mesh(*tetrahedron())
+    for one in (mesh, pickle.loads(pickle.dumps(mesh)), copy.deepcopy(mesh)):
+        before = getattr(one, name).copy()
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(one, name)[0] = 5
+        np.testing.assert_array_equal(getattr(one, name), before)
 
 
 def test_edges_are_each_once_and_sorted(bar):

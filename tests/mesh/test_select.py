@@ -220,8 +220,15 @@ def test_a_selection_is_a_value(bar):
     assert pickle.loads(pickle.dumps(one)) == copy.deepcopy(one) == one
     mask[:] = False
     assert len(one) == 73
-    with pytest.raises(ValueError, match="read-only"):
-        one.mask[0] = False
+    for same in (one, pickle.loads(pickle.dumps(one)), copy.deepcopy(one), copy.copy(one)):
+        assert len(same.vertices) == 73
+        for array in (same.mask, same.vertices):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = False
+    own = np.zeros(722, bool)
+    made = jd.Selection(bar, own)
+    own[3] = True  # the caller's stays his, and the selection's its own
+    assert not len(made)
     assert repr(one) == "Selection(73 of 722 vertices)"
     np.testing.assert_array_equal(bar.vertices[one], bar.vertices[one.vertices])
     np.testing.assert_array_equal(jnp.asarray(one), one.vertices)
@@ -287,6 +294,11 @@ def test_an_empty_selection_is_told_where_the_mesh_is(bar):
         (lambda m: jd.select.nearest(m, [0, 0]), "point is .*three finite numbers"),
         (lambda m: jd.select.sphere(m, [0, 0, 0], -1.0), "radius is -1.0: give a finite number"),
         (lambda m: jd.select.mask(m, [1] * 722), "mask has shape .* and type int64: give booleans"),
+        (lambda m: jd.Selection(m, None), "mask cannot be read as numbers: it is None"),
+        (lambda m: jd.Selection(m, [True, False]), r"mask has shape \(2,\) .*booleans \(722,\)"),
+        (lambda m: jd.Selection(m, 3), r"mask has shape \(\) and type int64: give booleans"),
+        (lambda m: jd.Selection(m, np.ones(722)), "mask has shape .* and type float64"),
+        (lambda m: jd.Selection(m.vertices, np.ones(722, bool)), "mesh is a ndarray: give a jd"),
         (lambda m: jd.select.component(m, 722), "vertex 722 .*out of range: vertices are 0 to 721"),
         (lambda m: jd.select.component(m, True), "vertices: the mask has shape"),
     ],
