@@ -21,7 +21,7 @@ from jaxdeform._mesh.ply import rewrite_ply, vertex_columns
 from jaxdeform._mesh.ply_writing import to_ply
 from jaxdeform._mesh.polygons import from_triangles, triangles
 from jaxdeform._mesh.reading import mark_of, read_bytes, without_mark
-from jaxdeform._mesh.stl import check_single_precision, is_binary
+from jaxdeform._mesh.stl import check_stl, is_binary
 from jaxdeform._mesh.writing import check_place, write_atomically
 
 # Cutting ears takes time by the square of the corners: 5,000 take two seconds.
@@ -84,7 +84,7 @@ def save_mesh(
 
     OBJ, OFF, text STL and PLY keep every bit: a PLY's ``float`` positions become ``double`` if they
     need more digits than ``float`` holds. Binary STL keeps single precision, with a warning if an
-    edge feels it.
+    edge feels it. Any STL makes one vertex of those in one place, with a warning if there are such.
 
     The file is written under a temporary name, brought to the disk and then renamed, so an old file
     is either kept or replaced as a whole. It keeps its permissions, and a symbolic link stays one.
@@ -98,7 +98,8 @@ def save_mesh(
 
     **Raises** InputError: the suffix is unknown; the folder cannot be written; the file is
     read-only; a shape is wrong; a position is not finite; a rigidity is not finite or negative;
-    faces would collapse in STL's single precision.
+    `load_mesh` would refuse the file: no face of the pose has an area, its lengths are out of
+    range, or in an STL a face would have two corners in one place.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -123,6 +124,8 @@ def save_mesh(
             f"{path}: vertex {bad[0]} is {points[bad[0]].tolist()} ({bad.size} in total): not "
             "written, because no program could read it; give finite positions"
         )
+    if vertices is not None:
+        _check_pose(path, points, mesh)
     if rigidity is not None:
         if suffix != ".ply":
             raise InputError(f"{path}: only PLY carries rigidity per vertex: use a .ply name")
@@ -134,15 +137,24 @@ def save_mesh(
     write_atomically(path, content)
 
 
+def _check_pose(path: Path, points: np.ndarray, mesh: Mesh) -> None:
+    """Raise InputError unless the positions make a mesh that `load_mesh` would take."""
+    try:
+        Mesh(points, mesh.faces)
+    except InputError as error:
+        raise InputError(
+            f"{path}: not written, because load_mesh would refuse it ({error}): give another pose"
+        ) from error
+
+
 def _content(
     path: Path, suffix: str, mesh: Mesh, points: np.ndarray, rigidity: np.ndarray | None
 ) -> bytes:
     source = mesh.source if mesh.source and mesh.source.suffix == suffix else None
     if source and rigidity is None and np.array_equal(points, source.points):
         return source.data
-    if _is_binary_stl(suffix, mesh):
-        loss = check_single_precision(path, points, mesh.faces)
-        if loss:
+    if suffix == ".stl":
+        for loss in check_stl(path, points, mesh.faces, binary=not _is_text_stl(mesh)):
             warnings.warn(loss, stacklevel=3)
     to_bytes, rewrite = FORMATS[suffix].to_bytes, FORMATS[suffix].rewrite
     if rigidity is not None:
@@ -258,8 +270,8 @@ def check_output(path: str | os.PathLike, mesh: Mesh | None = None) -> None:
     path = Path(path)
     suffix = format_of(path)
     check_place(path)
-    if mesh and _is_binary_stl(suffix, mesh):
-        check_single_precision(path, mesh.vertices, mesh.faces)
+    if mesh and suffix == ".stl":
+        check_stl(path, mesh.vertices, mesh.faces, binary=not _is_text_stl(mesh))
 
 
 def without_suffix(path: Path) -> Path:
@@ -267,6 +279,7 @@ def without_suffix(path: Path) -> Path:
     return (path.with_suffix("") if path.suffix.lower() == ".gz" else path).with_suffix("")
 
 
-def _is_binary_stl(suffix: str, mesh: Mesh) -> bool:
-    text = mesh.source and mesh.source.suffix == ".stl" and not is_binary(mesh.source.data)
-    return suffix == ".stl" and not text
+def _is_text_stl(mesh: Mesh) -> bool:
+    """Return whether the mesh was read from a text STL, and so is written as one."""
+    source = mesh.source
+    return source is not None and source.suffix == ".stl" and not is_binary(source.data)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxdeform._errors import InputError
 from jaxdeform._mesh.mesh import merge_equal_points
@@ -117,29 +117,44 @@ def _filled(facets: np.ndarray, points: np.ndarray, polygons: Polygons) -> bytes
     return facets.tobytes()
 
 
-def check_single_precision(path: Path, points: np.ndarray, faces: np.ndarray) -> str | None:
-    """Return what a binary file would lose that matters, or None.
+def check_stl(path: Path, points: np.ndarray, faces: np.ndarray, *, binary: bool) -> list[str]:
+    """Return what a file would lose that matters.
 
-    **Raises** InputError: a face would lose a vertex or all area, or a number is out of range, so
-    that no program could read the mesh again.
+    **Raises** InputError: two corners of a face lie or would lie in one place, or a number is out
+    of range, so that `load_mesh` could not read the mesh again.
     """
-    with np.errstate(over="ignore"):
-        single = points.astype(np.float32).astype(np.float64)
-    loss = float(np.abs(single - points).max())
-    move = "write .obj, .off or .ply, or move the mesh near the origin"
-    corner, rounded = points[faces], single[faces]
-    equal = (rounded == np.roll(rounded, 1, axis=1)).all(axis=2).any(axis=1)
-    equal &= ~(corner == np.roll(corner, 1, axis=1)).all(axis=2).any(axis=1)
-    if equal.any() or not np.isfinite(loss):
+    corner, move = points[faces], "write .obj, .off or .ply"
+    equal = _repeats_a_place(corner)
+    if equal.any():
         raise InputError(
-            f"{path}: not written: STL keeps single precision, in which positions move by up to "
-            f"{loss:.2g} and {int(equal.sum())} faces collapse (face {int(equal.argmax())}): {move}"
+            f"{path}: not written: {int(equal.sum())} faces have two corners in one place (face "
+            f"{int(equal.argmax())}), and STL makes one vertex of those: {move}"
         )
-    edge = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2)
-    shortest = float(edge.min())
-    if loss > 1e-3 * shortest:
-        return (
-            f"{path}: STL keeps single precision: positions move by up to {loss:.2g}, and the "
-            f"shortest edge is {shortest:.2g}: {move}"
+    lost, kept = [], points
+    if binary:
+        with np.errstate(over="ignore"):
+            kept = points.astype(np.float32).astype(np.float64)
+        loss = float(np.abs(kept - points).max())
+        moves = f"STL keeps single precision, in which positions move by up to {loss:.2g} and"
+        near = f"{move}, or move the mesh near the origin"
+        equal = _repeats_a_place(kept[faces])
+        if equal.any() or not np.isfinite(loss):
+            raise InputError(
+                f"{path}: not written: {moves} {int(equal.sum())} faces collapse (face "
+                f"{int(equal.argmax())}): {near}"
+            )
+        edge = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2)
+        if loss > 1e-3 * edge.min():
+            lost = [f"{path}: {moves} the shortest edge is {edge.min():.2g}: {near}"]
+    used = np.unique(faces)
+    joined = len(used) - len(merge_equal_points(kept[used])[0])
+    if joined:
+        lost.append(
+            f"{path}: STL makes one vertex of those in one place, so that {joined} fewer come back "
+            f"and surfaces that were apart may hang together: {move}"
         )
-    return None
+    return lost
+
+
+def _repeats_a_place(corner: Float[np.ndarray, "faces 3 3"]) -> Bool[np.ndarray, "faces"]:
+    return (corner == np.roll(corner, 1, axis=1)).all(axis=2).any(axis=1)

@@ -6,7 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers import replaced
+from helpers import CASES, replaced, tetrahedron
 
 import jaxdeform as jd
 from jaxdeform._mesh.files import check_output
@@ -206,10 +206,75 @@ def test_stl_says_what_single_precision_loses(tmp_path):
             assert not path.exists()
             continue
         if outcome == "warning":
-            with pytest.warns(UserWarning, match=r"move by up to 0\.\d+, and the shortest edge is"):
+            with pytest.warns(UserWarning, match=r"move by up to 0\.\d+ and the shortest edge is"):
                 jd.save_mesh(path, mesh)
         else:
             jd.save_mesh(path, mesh)
         assert jd.load_mesh(path).n_faces == 8
     with pytest.raises(jd.InputError, match="not written: STL keeps single precision"):
         jd.save_mesh(path, small, vertices=small.vertices * 1e39)
+
+
+TEXT_STL = CASES / "46_upper_crlf.stl"
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_an_stl_that_could_not_be_read_is_not_written(tmp_path, text):
+    """A face with two corners in one place, at rest or in a pose."""
+    path = tmp_path / "m.stl"
+    mesh = jd.load_mesh(TEXT_STL) if text else jd.shapes.square()
+    a, b, _ = mesh.faces[0]
+    pose = replaced(mesh.vertices, a, mesh.vertices[b])
+    both = [{a, b} <= set(face) for face in mesh.faces.tolist()]
+    jd.save_mesh(path, mesh)
+    before = path.read_bytes()
+    message = rf"m\.stl: not written: {sum(both)} faces have two corners in one place \(face 0\)"
+    with pytest.raises(jd.InputError, match=message):
+        jd.save_mesh(path, mesh, vertices=pose)
+    if not text:
+        for door in (jd.save_mesh, check_output):
+            with pytest.raises(jd.InputError, match=message):
+                door(path, jd.Mesh(pose, mesh.faces))
+    assert path.read_bytes() == before
+    # Formats that share vertices hold it.
+    jd.save_mesh(tmp_path / "m.off", mesh, vertices=pose)
+    np.testing.assert_array_equal(jd.load_mesh(tmp_path / "m.off").vertices, pose)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_vertices_that_an_stl_joins_are_told(tmp_path, text):
+    """Two tetrahedra that touch with a corner in the pose."""
+    path = tmp_path / "m.stl"
+    v, f = tetrahedron()
+    both = np.concatenate([v, tetrahedron([2, 0, 0])[0], [[9, 9, 9]]])
+    mesh = jd.Mesh(both, np.concatenate([f, f + 4]))
+    if text:
+        lines = ["solid"]
+        for face in mesh.vertices[mesh.faces].tolist():
+            corners = [f"vertex {x} {y} {z}" for x, y, z in face]
+            lines += ["facet normal 0 0 1", "outer loop", *corners, "endloop", "endfacet"]
+        path.write_text("\n".join([*lines, "endsolid"]))
+        mesh = jd.load_mesh(path)
+    jd.save_mesh(path, mesh, vertices=mesh.vertices + 0.5)  # apart, and nothing to tell
+    shift = np.where(mesh.vertices[:, :1] >= 2, [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    with pytest.warns(UserWarning, match="one vertex of those in one place, so that 1 fewer come"):
+        jd.save_mesh(path, mesh, vertices=mesh.vertices + shift)
+    back = jd.load_mesh(path)
+    assert (back.n_vertices, back.n_faces) == (7, 8)
+
+
+@pytest.mark.parametrize("suffix", [".off", ".obj", ".ply", ".stl", ".ply.gz"])
+def test_a_pose_that_could_not_be_read_is_not_written(tmp_path, odd, suffix):
+    path = tmp_path / f"m{suffix}"
+    jd.save_mesh(path, odd)
+    before = path.read_bytes()
+    for pose, message in (
+        (0 * odd.vertices, "load_mesh would refuse it .face 0 .* has no area"),
+        (odd.vertices * [1, 0, 0], "load_mesh would refuse it .face 0 .* has no area"),
+        (odd.vertices * 1e150, "load_mesh would refuse it .vertex .* leave the range of float64"),
+        (odd.vertices * 1e-150, "load_mesh would refuse it .the mesh is .* leave the range"),
+    ):
+        with pytest.raises(jd.InputError, match=rf"m{suffix}: not written, because {message}"):
+            jd.save_mesh(path, odd, vertices=pose)
+    assert path.read_bytes() == before
+    assert len(os.listdir(tmp_path)) == 1
