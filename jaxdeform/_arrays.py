@@ -17,6 +17,9 @@ from jaxdeform._errors import ArrayLike, InputError, a_or_an, shown
 # NumPy's own limit. Lists that contain themselves have no end.
 _MOST_AXES = 64
 
+_BOOLEAN = (bool, np.bool_)
+_NUMBER = (int, float, np.number, *_BOOLEAN)
+
 
 def is_concrete(x) -> bool:
     """Return whether the values of an array can be read now; while JAX traces they cannot."""
@@ -96,7 +99,7 @@ def float_type(value: ArrayLike) -> np.dtype:
 
 
 def _leaves(value, name: str) -> list:
-    """Return the entries of nested lists, unless one is masked; of anything else none."""
+    """Return the entries of nested lists, unless one is odd among them; of anything else none."""
     leaves = list(value) if isinstance(value, list | tuple) else []
     for _ in range(_MOST_AXES):
         if not any(isinstance(x, list | tuple) for x in leaves):
@@ -109,6 +112,9 @@ def _leaves(value, name: str) -> list:
             raise _unreadable(
                 name, "some entries are masked: give x.filled(number), or leave them out"
             )
+    kinds = {isinstance(x, _BOOLEAN) for x in leaves if isinstance(x, _NUMBER)}
+    if len(kinds) == 2:  # NumPy would take True for 1
+        raise _unreadable(name, "it holds booleans among numbers: give numbers only")
     return leaves
 
 

@@ -78,3 +78,15 @@ def test_what_numpy_works_out_cannot_be_traced(calls, function, argument):
     for traced in (given, list(given)):
         with pytest.raises(jd.InputError, match=rf"{argument}: traced by JAX .*known numbers"):
             jax.jit(lambda x: call(**arguments | {argument: x}))(traced)
+
+
+@pytest.mark.parametrize("odd", [[True, 0], [0, np.True_], (1.5, False), [[0, 1, 2], [0, True, 3]]])
+def test_booleans_among_numbers_are_refused(odd):
+    """NumPy would take True for 1."""
+    for call in (
+        lambda: jd.precompute(jd.shapes.square(), odd),
+        lambda: jd.rigid_targets(odd, [0, 0], np.zeros((1, 3)), np.zeros((1, 3))),
+        lambda: jd.Mesh(np.eye(4)[:, :3], odd),
+    ):
+        with pytest.raises(jd.InputError, match="holds booleans among numbers: give numbers only"):
+            call()

@@ -1,15 +1,18 @@
 """Handle files: JSON, and the .sel/.def pairs of the survey of Botsch and Sorkine (2008)."""
 
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_numbers
 from jaxdeform._checks import check_type, read_path
 from jaxdeform._errors import InputError, shown
+from jaxdeform._handles.targets import rotate, run_motion, translate
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.reading import read_json, read_text
 from jaxdeform._mesh.select import some_where
@@ -41,8 +44,9 @@ def load_handles(
       names its vertices by an expression (see ``jd.select.where``), by their indices, or by a mask
       of booleans. It may have
       ``"rotation": {"axis": [0, 1, 0], "degrees": 90, "center": [0, 0, 0]}`` (by default the centre
-      is the centroid of the group), ``"translation": [1, 0, 0]``, or both, or instead
-      ``"targets": [[x, y, z], ...]``. A group with none of them stays where it is.
+      is the centroid of the group; the axis may be ``"y"`` too), ``"translation": [1, 0, 0]``, or
+      both (rotated first), or instead ``"targets": [[x, y, z], ...]``. A group with none of them
+      stays where it is.
     - ``.sel`` with ``.def``: one number per vertex (0 fixed, 1 free, 2 handle), and the 4x4 matrix
       of the handle. Format of Botsch and Sorkine, "On linear variational surface deformation
       methods" (2008), doi:10.1109/TVCG.2007.1054.
@@ -130,29 +134,34 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
         if not isinstance(given, dict) or "degrees" not in given or "axis" not in given:
             raise InputError(f'{where}: rotation needs "axis" and "degrees"')
         _check_keys(f"{where}: rotation", given, "axis", "degrees", "center")
-        axis = _numbers(where, "axis", given["axis"], (3,))
-        length = np.linalg.norm(axis)
-        if length == 0:
-            raise InputError(f"{where}: the rotation axis has length zero: give a direction")
+        axis, center = given["axis"], None
+        if not isinstance(axis, str):
+            axis = _numbers(where, "axis", axis, (3,))
         degrees = _numbers(where, "degrees", given["degrees"], ())
-        center = points.mean(axis=0)
         if "center" in given:
             center = _numbers(where, "center", given["center"], (3,))
-        # SciPy rotates in double precision, whatever JAX is set to.
-        rotation = scipy.spatial.transform.Rotation.from_rotvec(axis / length * np.radians(degrees))
-        points = rotation.apply(points - center) + center
+        points = _run(f"{where}: rotation", rotate, points, degrees, axis=axis, center=center)
     if "translation" in group:
-        points = points + _numbers(where, "translation", group["translation"], (3,))
+        offset = _numbers(where, "translation", group["translation"], (3,))
+        points = _run(f"{where}: translation", translate, points, offset)
     return points
+
+
+def _run(where: str, motion: Callable, *arguments, **settings) -> np.ndarray:
+    """Return where the points move to, or raise InputError with the place in the file."""
+    try:
+        return np.asarray(motion(*arguments, **settings))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _numbers(where: str, name: str, value, shape: tuple[int, ...]) -> np.ndarray:
     try:
-        array = np.asarray(value)
-    except ValueError:
-        array = np.asarray("")
-    if array.dtype.kind not in "iuf":
-        raise InputError(f"{where}: {name}: give numbers")
+        array = read_numbers(value, name)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    if array.dtype == bool:
+        raise InputError(f"{where}: {name}: true and false are no numbers: give numbers")
     array = array.astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         size = f"{' x '.join(map(str, shape))} finite numbers" if shape else "one finite number"
@@ -188,7 +197,8 @@ def _parse_survey(path: Path, motion: Path, mesh: Mesh) -> tuple[np.ndarray, np.
     handles = np.flatnonzero(status != "1")
     targets = mesh.vertices[handles].copy()
     grabbed = status[handles] == "2"
-    targets[grabbed] = targets[grabbed] @ matrix[:3, :3].T + matrix[:3, 3]
+    move = partial(run_motion, lambda points: points @ matrix[:3, :3].T + matrix[:3, 3])
+    targets[grabbed] = _run(f"{motion}: the matrix", move, targets[grabbed])
     return handles, targets
 
 

@@ -2,11 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxdeform._arrays import float_type
+from jaxdeform._arrays import float_type, is_concrete
 from jaxdeform._checks import check_labels, check_positions, rows_of_three
 from jaxdeform._errors import ArrayLike
+from jaxdeform._handles.targets import check_angle, run_motion
 from jaxdeform._linalg.rotations import rotation_matrices
 
 
@@ -27,14 +28,14 @@ def rigid_targets(
     - points: (handles, 3), rest positions of the handles.
     - group: (handles,), the group of each handle, from 0.
     - rotations: (groups, 3), rotation vectors: the direction is the axis, the length is the angle
-      in radians.
+      in radians, at most 1e9 degrees.
     - translations: (groups, 3), in the unit of the points.
     - centers: (groups, 3), the centre of each rotation; by default the centroid of each group.
 
     **Returns** (handles, 3).
 
     **Raises** InputError: shapes that do not fit together; values that are not finite; a group out
-    of range.
+    of range; more than 1e9 degrees; targets that overflow.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
@@ -48,15 +49,36 @@ def rigid_targets(
     dtype = float_type(points)
     points = rows_of_three("points", points, dtype, unit="handle")
     rotations = rows_of_three("rotations", rotations, dtype, unit="group")
+    if is_concrete(rotations):
+        _check_angles(np.asarray(rotations, np.float64))
     shape = rotations.shape
     translations = check_positions("translations", translations, shape, dtype, unit="group")
     group = check_labels("group", group, len(points), "handle", len(rotations))
+    if centers is not None:
+        centers = check_positions("centers", centers, shape, dtype, unit="group")
+    return jnp.asarray(run_motion(_moved, points, group, rotations, translations, centers))
+
+
+def _check_angles(rotations: Float[np.ndarray, "groups 3"]) -> None:
+    with np.errstate(over="ignore"):
+        x, y, z = np.degrees(rotations).T
+        angles = np.hypot(np.hypot(x, y), z)
+    most = int(angles.argmax())
+    check_angle(f"in degrees, the rotation of group {most} is by", float(angles[most]))
+
+
+def _moved(
+    points: Float[Array, "handles 3"],
+    group: Int[np.ndarray, "handles"],
+    rotations: Float[Array, "groups 3"],
+    translations: Float[Array, "groups 3"],
+    centers: Float[Array, "groups 3"] | None,
+) -> Float[Array, "handles 3"]:
+    shape, dtype = rotations.shape, points.dtype
     if centers is None:
         size = np.maximum(np.bincount(group, minlength=len(rotations)), 1)
         total = jnp.zeros(shape, dtype).at[group].add(points)
         centers = total / jnp.asarray(size, dtype)[:, None]
-    else:
-        centers = check_positions("centers", centers, shape, dtype, unit="group")
     moved = jnp.einsum(
         "hij,hj->hi",
         rotation_matrices(rotations)[group],

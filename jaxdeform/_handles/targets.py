@@ -43,7 +43,7 @@ def translate(points: ArrayLike, offset: ArrayLike) -> Points:
     xp = _namespace(points, offset)
     points = _points(xp, points)
     offset = _numbers(xp, "offset", offset, points.dtype, (3,), points.shape)
-    return _run(operator.add, points, xp.broadcast_to(offset, points.shape))
+    return run_motion(operator.add, points, xp.broadcast_to(offset, points.shape))
 
 
 def rotate(
@@ -73,7 +73,8 @@ def rotate(
     if center is not None:
         center = _numbers(xp, "center", center, points.dtype, (3,))
     run = _rotate_compiled if xp is jnp else partial(_rotate, np)
-    return _run(run, points, _degrees(xp, degrees, points.dtype), read_axis("axis", axis), center)
+    angle = _degrees(xp, degrees, points.dtype)
+    return run_motion(run, points, angle, read_axis("axis", axis), center)
 
 
 def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLike = "y") -> Points:
@@ -97,7 +98,7 @@ def twist(points: ArrayLike, degrees: ArrayLike = 90.0, *, along: str | ArrayLik
     points = _points(xp, points)
     axis = read_axis("along", along)
     run = _twist_compiled if xp is jnp else partial(_twist, np)
-    return _run(run, points, _degrees(xp, degrees, points.dtype), axis)
+    return run_motion(run, points, _degrees(xp, degrees, points.dtype), axis)
 
 
 def bend(
@@ -135,7 +136,7 @@ def bend(
             "than its own"
         )
     run = _bend_compiled if xp is jnp else partial(_bend, np)
-    return _run(run, points, _degrees(xp, degrees, points.dtype), up, normal / length)
+    return run_motion(run, points, _degrees(xp, degrees, points.dtype), up, normal / length)
 
 
 # ---------------------------------------------------------------- checks of the arguments
@@ -175,20 +176,27 @@ def _numbers(xp, name: str, value: ArrayLike, dtype, *shapes: tuple[int, ...]):
 
 def _degrees(xp, degrees: ArrayLike, dtype):
     array = _numbers(xp, "degrees", degrees, dtype, ())
-    if not isinstance(array, Tracer) and abs(float(array)) > _MOST_DEGREES:
-        raise InputError(
-            f"degrees is {float(array):g}, of which rounding leaves no angle: give at most "
-            f"{_MOST_DEGREES:g}"
-        )
+    if not isinstance(array, Tracer):
+        check_angle("degrees is", float(array))
     return array
 
 
-def _run(motion, points, *arguments) -> Points:
+def check_angle(what: str, degrees: float) -> None:
+    """Raise InputError for an angle that its whole turns leave without digits."""
+    if abs(degrees) > _MOST_DEGREES:
+        raise InputError(
+            f"{what} {degrees:g}, of which rounding leaves no angle: give at most {_MOST_DEGREES:g}"
+        )
+
+
+def run_motion(motion, points, *arguments) -> Points:
     """Move the points, or raise InputError if they overflow."""
     with np.errstate(over="ignore", invalid="ignore"):
         moved = motion(points, *arguments)
     if not isinstance(moved, Tracer) and not np.isfinite(np.asarray(moved)).all():
-        raise InputError("the moved points overflow: scale the points down")
+        raise InputError(
+            "the moved points overflow: give a smaller motion, or points in a larger unit"
+        )
     return moved
 
 

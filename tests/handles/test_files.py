@@ -63,6 +63,16 @@ def test_groups_by_expressions_are_those_by_their_indices(tmp_path, bar):
         np.testing.assert_array_equal(found.targets, want.targets)
 
 
+@pytest.mark.parametrize("axis", [[1e308, 1e308, 0], [1e200, 1e200, 0], [1e-200, 1e-200, 0], "x"])
+def test_an_axis_may_have_any_length_or_be_a_name(tmp_path, bar, axis):
+    rotation = {"axis": axis, "degrees": 50, "center": [1, 2, 3]}
+    found = jd.load_handles(write(tmp_path, {"vertices": [3, 700], "rotation": rotation}), bar)
+    plain = [1, 0, 0] if axis == "x" else [1, 1, 0]
+    want = turned(bar.vertices[[3, 700]], plain, 50, np.array([1, 2, 3]))
+    np.testing.assert_allclose(found.targets, want, atol=EXACT)
+    assert found.targets.dtype == np.float64
+
+
 def test_a_wrong_expression_in_a_file_has_its_caret(tmp_path, bar):
     with pytest.raises(jd.InputError) as caught:
         jd.load_handles(write(tmp_path, {"where": "y < 6 &"}), bar)
@@ -93,7 +103,28 @@ BAD_GROUPS = {
         {"vertices": [5], "traslation": [0, 0, 1]},
     ],
     "group 0: translation: give 3 finite numbers": [{**GOOD, "translation": [0, 1]}],
-    "group 0: translation: give numbers": [{**GOOD, "translation": ["a", 1, 2]}],
+    "group 0: translation cannot be read as numbers: it is text": [
+        {**GOOD, "translation": ["a", 1, 2]}
+    ],
+    "group 0: translation cannot be read as numbers: it holds booleans among numbers": [
+        {**GOOD, "translation": [True, 0, 0]}
+    ],
+    "group 0: translation: true and false are no numbers: give numbers": [
+        {**GOOD, "translation": [True, False, False]}
+    ],
+    "group 0: translation: the moved points overflow: give a smaller motion": [
+        {
+            "vertices": [0, 1],
+            "rotation": {"axis": [0, 0, 1], "degrees": 180, "center": [0.8e308, 0, 0]},
+            "translation": [1.7e308, 0, 0],
+        }
+    ],
+    "group 0: rotation: the moved points overflow": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": 180, "center": [1.7e308, 0, 0]}}
+    ],
+    "group 0: handles cannot be read as numbers: it holds booleans among numbers": [
+        {"vertices": [True, 0]}
+    ],
     "group 0: targets: give 2 x 3 finite": [{**GOOD, "targets": [[0, 1, 2]]}],
     "group 0: targets: give 2 x 3 finite numbers": [
         {**GOOD, "targets": [[0, 1, float("nan")], [0, 0, 0]]}
@@ -102,10 +133,24 @@ BAD_GROUPS = {
         {**GOOD, "targets": [[0, 0, 0], [1, 1, 1]], "translation": [0, 0, 1]}
     ],
     'group 0: rotation needs "axis" and "degrees"': [{**GOOD, "rotation": {"axis": [0, 0, 1]}}],
-    "group 0: the rotation axis has length zero": [
+    "group 0: rotation: axis is .0. 0. 0..: give 'x', 'y', 'z' or a vector .3,. that is not": [
         {**GOOD, "rotation": {"axis": [0, 0, 0], "degrees": 9}}
     ],
-    "group 0: axis: give numbers": [{**GOOD, "rotation": {"axis": "z", "degrees": 9}}],
+    "group 0: rotation: axis is 'w': give 'x', 'y', 'z' or": [
+        {**GOOD, "rotation": {"axis": "w", "degrees": 9}}
+    ],
+    "group 0: axis cannot be read as numbers: it holds booleans": [
+        {**GOOD, "rotation": {"axis": [0, 0, True], "degrees": 9}}
+    ],
+    "group 0: degrees: true and false are no numbers": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": True}}
+    ],
+    "group 0: rotation: degrees is 1e.12, of which rounding leaves no angle: give at most": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": 1e12}}
+    ],
+    "group 0: rotation: degrees is -1e.300, of which rounding": [
+        {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": -1e300}}
+    ],
     "group 0: degrees: give one finite number": [
         {**GOOD, "rotation": {"axis": [0, 0, 1], "degrees": [1, 2]}}
     ],
@@ -146,9 +191,9 @@ def test_bad_groups_are_named(tmp_path, bar, message):
         ),
         (
             b'{"handles": [{"vertices": [0], "translation": [0, 0, ' + b"9" * 400 + b"]}]}",
-            "translation: give numbers",
+            "translation cannot be read as numbers: it holds 999",
         ),
-        (b'{"handles": [{"vertices": [0], "translation": ["1_0", 0, 0]}]}', "give numbers"),
+        (b'{"handles": [{"vertices": [0], "translation": ["1_0", 0, 0]}]}', "text: give numbers"),
         (b'{"handles": [{"vertices": [1000000000]}]}', "handle 1000000000 .* out of range"),
         (b'{"handles": [{"vertices": [0], "\\u001b[31m' + b"a" * 9999 + b'": 1}]}', "unknown key"),
     ],
@@ -204,7 +249,11 @@ def test_bad_survey_files_are_named(tmp_path):
         r"h.sel: vertex 1 is 'x{56}\.\.\.: give 0": (f"0 {'x' * 20_000} 2 1 1 1 2 1 0", MATRIX),
         "h.sel: no handles": ("1 " * 9, MATRIX),
         "h.def: the matrix: give 4 x 4 finite numbers": (good, MATRIX[:-8]),
-        "h.def: the matrix: give numbers": (good, MATRIX + "1\n"),
+        "h.def: the matrix cannot be read as numbers": (good, MATRIX + "1\n"),
+        "h.def: the matrix: the moved points overflow": (
+            good,
+            "1e308 0 0 1e308\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
+        ),
         r"h\.def: the matrix: give numbers": (good, MATRIX.replace("10", "1_0")),
         "h.def: the matrix: give 4 x 4 finite": (good, MATRIX.replace("10", "inf")),
         "h.def: the matrix ends in the row": (good, "1 0 0 0\n0 1 0 0\n0 0 1 0\n1 2 3 1\n"),

@@ -107,6 +107,13 @@ def bad_calls():
             points, [0.0, 1.0, 0.0], two, two
         ),
         "the group of handle 2 is 2, out of range": lambda: rigid(points, [0, 1, 2], two, two),
+        "the rotation of group 1 is by 5.7.*e.301, of which rounding": lambda: rigid(
+            points, group, [[0, 0, 1e9], [1e300, 0, 0]], two
+        ),
+        "the rotation of group 0 is by inf": lambda: rigid(
+            points, group, jnp.full((2, 3), 1e308), two
+        ),
+        "the moved points overflow": lambda: rigid(points, group, two, two + 1e308, two + 1e308),
         "the group of handle 1 is -1": lambda: rigid(points, [0, -1, 1], two, two),
     }
 
