@@ -65,8 +65,14 @@ class Solution(eqx.Module):
     def explain(self) -> str:
         """Return what happened in words, and name the first cells that are not as they should be.
 
-        Of one solution, not of a batch, and once the values are known.
+        Of one solution, once the values are known. Of a batch it raises InputError.
         """
+        batch = self.transforms.shape[:-3]
+        if batch:
+            raise InputError(
+                f"explain is of one solution, and these are a batch of shape {batch}: take one "
+                "member, as in jax.tree.map(lambda x: x[0], out).explain()"
+            )
         t = np.asarray(self.transforms)
         finite = np.isfinite(t).all(axis=(1, 2))
         orientation = np.einsum("ki,ki->k", t[:, 0], np.cross(t[:, 1], t[:, 2]))

@@ -195,7 +195,7 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
     **Returns** (vertices,) floats.
 
     **Raises** InputError: the file is not a PLY file, cannot be read, or lacks the vertex property
-    ``rigidity``.
+    ``rigidity``; a value is not finite or negative.
 
     Example:
         >>> import jaxdeform as jd, tempfile, pathlib
@@ -213,7 +213,12 @@ def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
             f"{path}: its vertices have no property 'rigidity' (only {', '.join(columns)}): write "
             "the file with jd.save_mesh(..., rigidity=...)"
         )
-    return columns["rigidity"]
+    values = columns["rigidity"]
+    try:
+        check_rigidity(values, len(values), values.dtype)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return values
 
 
 class FileArrays(NamedTuple):

@@ -93,6 +93,18 @@ def test_a_box_turned_over_its_handles_says_what_is_inside_out():
     assert ("inside out" in out.explain()) == bool(int(out.flipped))
 
 
+def test_a_batch_is_explained_member_by_member(sheet):
+    problem, targets = sheet
+    lam = np.array([0.1, 1.0])
+    out = jax.vmap(lambda r: jd.deform(problem, targets, r, solver=jd.Alternating(1)))(lam)
+    with pytest.raises(jd.InputError, match=r"a batch of shape \(2,\): take one member, as in jax"):
+        out.explain()
+    one = jax.tree.map(lambda x: x[0], out)
+    alone = jd.deform(problem, targets, lam[0], solver=jd.Alternating(1))
+    assert one.explain() == alone.explain()
+    assert one.explain().startswith("Ran the number of steps")
+
+
 def test_throw_raises_what_result_says(sheet):
     problem, targets = sheet
     short = {"solver": jd.QuasiNewton(max_steps=1)}

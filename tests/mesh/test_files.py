@@ -35,6 +35,20 @@ def test_rigidity_goes_with_a_ply(tmp_path, odd):
         jd.load_rigidity(tmp_path / "m.off")
 
 
+@pytest.mark.parametrize("value", ["nan", "-1.0", "inf", "-inf"])
+def test_a_rigidity_that_is_none_names_file_and_vertex(tmp_path, value):
+    path = tmp_path / "m.ply"
+    header = ["ply", "format ascii 1.0", "element vertex 3"]
+    header += [f"property double {name}" for name in ("x", "y", "z", "rigidity")]
+    header += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    rows = ["0 0 0 2", "1 0 0 0", f"0 1 0 {value}", "3 0 1 2"]
+    path.write_text("\n".join([*header, *rows, ""]))
+    with pytest.raises(jd.InputError, match=rf"m\.ply: rigidity is {value} at vertex 2: it must"):
+        jd.load_rigidity(path)
+    path.write_text(path.read_text().replace(value, "7.5"))
+    assert jd.load_rigidity(path).tolist() == [2, 0, 7.5]
+
+
 def test_missing_files_and_folders(tmp_path):
     (tmp_path / "folder.off").mkdir()
     for name in ("missing.off", "folder.off", "missing/x.ply"):
