@@ -2,6 +2,7 @@
 
 from collections import deque
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,9 +22,12 @@ def cut_ears(flat: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "triangles 3"]:
     is left, a few times at most. So n corners take at most a few n tests, each of n numbers.
     """
     n = len(flat)
-    before, after = np.arange(-1, n - 1) % n, np.arange(1, n + 1) % n
+    # Corners as complex numbers: Python is faster than NumPy with one of them at a time.
+    points = flat @ np.array([1, 1j])
+    corner: list[complex] = points.tolist()
+    before, after = [n - 1, *range(n - 1)], [*range(1, n), 0]
     here = np.ones(n, bool)
-    outward = _outward(flat[before], flat, flat[after])
+    outward = np.array([_outward(corner[k - 1], corner[k], corner[after[k]]) for k in range(n)])
     out: list[tuple[int, int, int]] = []
     for _ in range(8):
         # Every second corner first, or one corner would collect long thin triangles.
@@ -32,16 +36,17 @@ def cut_ears(flat: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "triangles 3"]:
         cut_before = len(out)
         while waiting and len(out) < n - 3:
             b = waiting.popleft()
-            a, c = int(before[b]), int(after[b])
-            if not here[b] or not _is_ear(flat, flat[here & ~outward], a, b, c):
+            a, c = before[b], after[b]
+            if not (here[b] and outward[b]):
+                continue
+            if _covers(corner[a], corner[b], corner[c], points, here & ~outward):
                 continue
             out.append((a, b, c))
             here[b] = False
             after[a], before[c] = c, a
-            for corner in (a, c):
-                ends = flat[before[corner]], flat[corner], flat[after[corner]]
-                outward[corner] = _outward(*ends)
-                waiting.append(corner)
+            for k in (a, c):
+                outward[k] = _outward(corner[before[k]], corner[k], corner[after[k]])
+                waiting.append(k)
         if len(out) in (cut_before, n - 3):
             break
     left = np.flatnonzero(here)
@@ -49,31 +54,36 @@ def cut_ears(flat: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "triangles 3"]:
     return np.array(out)
 
 
-def _outward(a, b, c):
-    """Return whether the corners b turn to the polygon's side, by more than rounding."""
+def _outward(a: complex, b: complex, c: complex) -> bool:
+    """Return whether the corner b turns to the polygon's side, by more than rounding."""
     return _area(a, b, c) > _FLAT * _longest(a, b, c) ** 2
 
 
-def _area(a, b, c):
-    """Return twice the signed area of triangles."""
-    u, v = b - a, c - a
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+def _area(a: complex, b: complex, c: Any) -> Any:
+    """Return twice the signed area of triangles; c may be an array."""
+    return ((b - a).conjugate() * (c - a)).imag
 
 
-def _longest(a, b, c):
-    return np.maximum(np.maximum(abs(b - a), abs(c - b)), abs(a - c)).max(axis=-1)
+def _longest(a: complex, b: complex, c: complex) -> float:
+    return max(abs(b - a), abs(c - b), abs(a - c))
 
 
-def _is_ear(flat: np.ndarray, others: np.ndarray, a: int, b: int, c: int) -> bool:
-    """Return whether the triangle has an area and none of the others in it or on its border."""
-    p, q, r = flat[a], flat[b], flat[c]
-    if not _outward(p, q, r):
-        return False
-    slack = -_FLAT * _longest(p, q, r) ** 2
-    inside = _area(p, q, others) >= slack
-    inside &= _area(q, r, others) >= slack
-    inside &= _area(r, p, others) >= slack
+def _covers(a: complex, b: complex, c: complex, points: np.ndarray, asked: np.ndarray) -> bool:
+    """Return whether the triangle has one of the points asked for in it or on its border."""
+    low = complex(min(a.real, b.real, c.real), min(a.imag, b.imag, c.imag))
+    high = complex(max(a.real, b.real, c.real), max(a.imag, b.imag, c.imag))
+    longest = _longest(a, b, c)
+    # Most lie outside its box.
+    margin = _FLAT * longest
+    x, y = np.real(points), np.imag(points)
+    near = asked & (x >= low.real - margin) & (x <= high.real + margin)
+    near &= (y >= low.imag - margin) & (y <= high.imag + margin)
+    inside = points[near]
+    for u, v in ((a, b), (b, c), (c, a)):
+        if not len(inside):
+            return False
+        inside = inside[_area(u, v, inside) >= -_FLAT * longest**2]
     # A border that runs back to itself, as around a hole, has corners in the same place.
-    for corner in (p, q, r):
-        inside &= np.abs(others - corner).max(axis=1) > _SAME
-    return not inside.any()
+    for end in (a, b, c):
+        inside = inside[np.abs(inside - end) > _SAME]
+    return len(inside) > 0

@@ -24,7 +24,7 @@ from jaxdeform._mesh.reading import mark_of, read_bytes, without_mark
 from jaxdeform._mesh.stl import check_stl, is_binary
 from jaxdeform._mesh.writing import check_place, write_atomically
 
-# Cutting ears takes time by the square of the corners: 5,000 take two seconds.
+# Cutting ears takes time by the square of the corners: 5,000 take half a second.
 _MOST_CORNERS = 5_000
 
 

@@ -157,19 +157,19 @@ def _lines(path: Path | None, data: bytes) -> Iterator[tuple[int, bytes]]:
     if b"\\" not in data:
         yield from enumerate(lines, 1)
         return
-    open_ = b""
+    open_: list[bytes] = []
     for number, line in enumerate(lines, 1):
         before_comment = line.split(b"#", 1)[0]
         goes_on = before_comment.rstrip().endswith(b"\\") and before_comment == line
         if goes_on:
-            open_ += line if path is None else line.rstrip()[:-1] + b" "
+            open_.append(line if path is None else line.rstrip()[:-1] + b" ")
             continue
-        yield number, open_ + line
-        open_ = b""
+        yield number, b"".join([*open_, line])
+        open_ = []
     if open_ and path is not None:
         raise damaged(path, "ends in a line that goes on")
     if open_:
-        yield len(lines), open_
+        yield len(lines), b"".join(open_)
 
 
 def color_words(data: bytes) -> list[list[bytes]]:

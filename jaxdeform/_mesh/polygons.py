@@ -64,6 +64,11 @@ def triangles(points: Float[np.ndarray, "points 3"], polygons: Polygons) -> np.n
         # The fan of polygons that name missing vertices: the mesh's own checks tell of them.
         local = np.tile(_fan(size), (len(same), 1, 1))
         good = whole[same] & (size > 3)
+        if size > _ALL_WAYS:
+            # Triangles that do not overlap are at most 2 d - 5, at d different vertices. A polygon
+            # with more corners than that overlaps itself, and would keep the search for ears long.
+            different = 1 + (np.diff(np.sort(table, axis=1), axis=1) > 0).sum(axis=1)
+            good &= size - 2 <= 2 * different - 5
         if good.any():
             local[good] = _cut(points, table[good])
         rows = first[same, None] + np.arange(size - 2)

@@ -1,6 +1,7 @@
 """Read the bytes of regular files: a pipe could hang, and a device may never end."""
 
 import json
+import re
 import stat
 import zlib
 from pathlib import Path
@@ -13,6 +14,11 @@ _MARK = b"\xef\xbb\xbf"
 # Meshes as text become 3 to 30 times smaller. More than this is no mesh, but a file that was made
 # to fill the memory.
 _MOST_EXPANSION = 200
+
+# What is read behind the end of a member is read again. So each is read in pieces, of which the
+# first is small and each twice as long as the one before.
+_FIRST_PIECE = 256
+_ZEROS = re.compile(rb"\0*")
 
 
 def read_bytes(path: Path) -> bytes:
@@ -71,22 +77,27 @@ def read_json(path: Path) -> Any:
 
 def _decompressed(path: Path, data: bytes) -> bytes:
     most = _MOST_EXPANSION * len(data) + 1
-    out, rest = b"", data
+    out = bytearray()
+    at = 0
     try:
-        while rest:  # a file may have several members
-            member = zlib.decompressobj(wbits=31)
-            out += member.decompress(rest, most - len(out))
-            if len(out) >= most:
-                raise InputError(
-                    f"{path}: is more than {_MOST_EXPANSION} times as long when decompressed: "
-                    "decompress it yourself if that is right"
-                )
+        while at < len(data):  # a file may have several members
+            member, size = zlib.decompressobj(wbits=31), _FIRST_PIECE
+            while not member.eof and at < len(data):
+                out += member.decompress(data[at : at + size], most - len(out))
+                if len(out) >= most:
+                    raise InputError(
+                        f"{path}: is more than {_MOST_EXPANSION} times as long when decompressed: "
+                        "decompress it yourself if that is right"
+                    )
+                at, size = at + size, 2 * size
             if not member.eof:
                 raise zlib.error("it ends too soon")
-            rest = member.unused_data.lstrip(b"\0")
+            at = min(at, len(data)) - len(member.unused_data)
+            zeros = _ZEROS.match(data, at)
+            at = zeros.end() if zeros else at
     except zlib.error as error:
         raise InputError(
             f"{path}: cannot be decompressed ({error}): the file is truncated or damaged; copy it "
             "again"
         ) from error
-    return out
+    return bytes(out)
