@@ -21,6 +21,7 @@ from jaxdeform._apps.arguments import make_folder
 from jaxdeform._apps.batch.command import batch
 from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.estimating import estimate
+from jaxdeform._apps.mouth import open_closed_outputs
 from jaxdeform._apps.talk import console, mouth, patiently, since
 from jaxdeform._plotting.files import check_picture_path
 
@@ -62,6 +63,7 @@ def set_up(
 
 def main() -> None:
     """Run the command line. An InputError becomes a line on standard error and exit code 2."""
+    open_closed_outputs()
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
         try:

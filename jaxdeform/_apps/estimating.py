@@ -11,7 +11,7 @@ from rich.table import Table
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import choose_parts, read_pose
-from jaxdeform._apps.results import as_json
+from jaxdeform._apps.results import as_json, save_result
 from jaxdeform._apps.talk import console, patiently, say_wrote, since
 from jaxdeform._errors import printable
 from jaxdeform._estimation.held_out import prediction_errors
@@ -74,12 +74,34 @@ def estimate(
     )
     fitted, kept = np.split(observed, [len(poses) - hold_out])
     fit = _fit(problem, fitted, label, steps)
-    jd.save_mesh(out, shape, rigidity=fit.field)
-    write_atomically(report, _as_text(fit, index))
+    failed = _saved(out, report, shape, fit, index)
     console.print(f"{fit.explain()}\nestimated in {since(began)}")
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
+    if failed:
+        raise failed
     say_wrote(out, report)
+
+
+def _saved(
+    out: Path, report: Path, shape: jd.Mesh, fit: jd.Estimate, handles: np.ndarray
+) -> jd.InputError | None:
+    """Write the field and the report; return why one could not be written.
+
+    A failure of one does not stop the other. A report without a file is printed.
+    """
+    failed = None
+    try:
+        save_result(out, shape, None, fit.field)
+    except jd.InputError as error:
+        failed = error
+    text = _as_text(fit, handles)
+    try:
+        write_atomically(report, text)
+    except jd.InputError as error:
+        failed = failed or error
+        console.print(text.decode(), end="")
+    return failed
 
 
 def _fit(problem: jd.Problem, observed, label: np.ndarray, steps: int | None) -> jd.Estimate:

@@ -5,6 +5,23 @@ import os
 import sys
 
 
+def open_closed_outputs() -> None:
+    """Send standard output and standard error nowhere where the caller closed them (``>&-``).
+
+    Python has None for them then. A file that is opened later would get their number, and with it
+    what libraries print.
+    """
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is not None:
+            continue
+        nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (as long as the process)
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(nowhere.fileno(), number)
+        setattr(sys, name, nowhere)
+
+
 class Mouth:
     """Writes to standard output until that fails; from then on it is silent.
 

@@ -12,7 +12,7 @@ from jaxdeform._mesh.files import without_suffix
 
 
 def save_result(
-    out: Path, mesh: jd.Mesh, vertices: np.ndarray, rigidity: np.ndarray | None
+    out: Path, mesh: jd.Mesh, vertices: np.ndarray | None, rigidity: np.ndarray | None
 ) -> None:
     """Write the result, or beside it, as PLY, what its format cannot hold."""
     with warnings.catch_warnings(record=True) as caught:
@@ -22,7 +22,7 @@ def save_result(
         except jd.InputError as error:
             rescue = without_suffix(out).with_suffix(".rescued.ply")
             try:
-                jd.save_mesh(rescue, mesh, vertices=vertices)
+                jd.save_mesh(rescue, mesh, vertices=vertices, rigidity=rigidity)
             except jd.InputError:
                 raise error from None
             raise jd.InputError(f"{error}; the result is in {rescue}") from error

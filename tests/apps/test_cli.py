@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -260,6 +261,30 @@ def test_the_result_is_written_though_nobody_listens(files, target, end):
     assert found == end
     assert jd.load_mesh(out).n_vertices == 722
     assert spoken_to(files, target, "inspect", out) == end
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell closes them")
+@pytest.mark.parametrize("shut", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_the_result_is_written_though_the_outputs_are_closed(files, shut):
+    """Python has None for a standard output or error that the shell closed."""
+    program = str(Path(sys.executable).parent / "jaxdeform")
+
+    def said(*words):
+        line = f"{shlex.join([program, *map(str, words)])} {shut}"
+        return subprocess.run(["sh", "-c", line], capture_output=True, text=True)
+
+    out = files / "out.ply"
+    done = said(
+        "deform", files / "bar.off", "--handles", files / "bend.json", "--rigidity", 1,
+        "-o", out, "--steps", 1,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert ("wrote" in done.stdout) == (shut == "2>&-")
+    assert jd.load_mesh(out).n_vertices == 722
+    assert said("inspect", out).returncode == 0
+    wrong = said("inspect", files / "none.off")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert wrong.stderr.count("\n") == (shut == ">&-")
 
 
 def test_a_mesh_of_quads_comes_back_as_quads(run, files):

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import jaxdeform as jd
+from jaxdeform._apps import estimating
 from jaxdeform._apps.arguments import parts_by_place
+from jaxdeform._mesh import files as mesh_files
 
 
 @pytest.mark.slow
@@ -150,3 +152,54 @@ def test_estimate_by_expressions_and_by_files_is_the_same(run, files, bar):
         found.append(jd.load_rigidity(files / "fit.ply"))
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], np.where(label, 30.0, 0.01), rtol=0.05)
+
+
+def test_an_estimate_is_told_though_it_cannot_be_written(run, files, bar, monkeypatch):
+    """The disk is full, say, when the work is done: the report is printed, and the run failed."""
+    fit = jd.Estimate(
+        rigidity=np.array([0.5]), material=np.array([0.1]), interval=np.array([[0.4, 0.6]]),
+        verdict=(jd.Verdict.determined,), displacement=np.ones((1, 2)),
+        discrepancy=jd.Discrepancy(False, 0.0, 0.0, 0.0, 0.0, 0, 0), field=np.full(722, 0.5),
+        vertices=bar.vertices[None], misfit=0.0, diagonal=1.0, solver_error=0.0,
+        outliers=np.zeros((1, 722), bool), history=np.zeros(2), result=jd.Result.converged,
+    )  # fmt: skip
+    monkeypatch.setattr(estimating, "_fit", lambda *_: fit)
+    writable = [False]
+
+    def write(path, content):
+        if not writable[0]:
+            raise jd.InputError(f"{path}: cannot write there (No space left on device): make room")
+        path.write_bytes(content)
+
+    for module in (estimating, mesh_files):
+        monkeypatch.setattr(module, "write_atomically", write)
+    words = "estimate", files / "bar.off", files / "bar.off", "-o", files / "f.ply"
+    code, out, err = run(*words)
+    assert code == 2
+    assert err == (
+        f"jaxdeform: {files}/f.ply: cannot write there (No space left on device): make room\n"
+    )
+    start = out.index("\n{\n") + 1
+    report, end = json.JSONDecoder().raw_decode(out[start:])
+    assert len(report["parts"]) == 1
+    assert "estimated in" in out[start + end :]
+    assert "wrote" not in out
+    # Where only the name cannot be written, the field is beside it.
+    writable[0] = True
+    real = jd.save_mesh
+
+    def save(path, *given, **named):
+        if path.name == "f.ply":
+            raise jd.InputError(f"{path}: is read-only: make it writeable")
+        real(path, *given, **named)
+
+    monkeypatch.setattr(jd, "save_mesh", save)
+    code, out, err = run(*words)
+    assert code == 2
+    assert err.endswith(
+        f"f.ply: is read-only: make it writeable; the result is in {files}/f.rescued.ply\n"
+    )
+    assert "estimated in" in out
+    assert json.loads((files / "f.json").read_text())["parts"] == report["parts"]
+    field = jd.load_rigidity(files / "f.rescued.ply")
+    np.testing.assert_array_equal(field, np.full(722, report["parts"][0]["rigidity"]))
