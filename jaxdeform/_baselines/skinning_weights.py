@@ -134,8 +134,11 @@ def bounded_biharmonic_weights(
     # Scale to unit size, because the tolerances of libigl are absolute.
     points = mesh.vertices - mesh.vertices.mean(axis=0)
     points = points / np.abs(points).max()
-    weights = igl.bbw(points, np.ascontiguousarray(mesh.solid_faces), index, np.eye(count)[group])
-    weights = np.clip(weights, 0.0, 1.0)
+    faces = np.ascontiguousarray(mesh.solid_faces)
+    try:
+        weights = np.clip(igl.bbw(points, faces, index, np.eye(count)[group]), 0.0, 1.0)
+    except RuntimeError:  # all that libigl says is that it failed
+        weights = np.zeros((mesh.n_vertices, count))
     total = weights.sum(axis=1, keepdims=True)
     if not np.isfinite(total).all() or total.min() < 0.1:
         raise InputError(

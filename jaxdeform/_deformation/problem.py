@@ -192,6 +192,12 @@ def _factorise(
         return used, matrix, factorise(matrix, free, dtype, positions=positions)
     except NotPositiveDefinite:
         pass
+    if not (used.weights > 0).any():
+        raise InputError(
+            f"cells: none of their {len(used.weights)} edge weights is positive, so nothing holds "
+            "the free vertices: give weights of your own to rings() or spokes(), such as "
+            "cotangent_weights(mesh) or ones"
+        )
     lifted = lifted_weights(used.weights)
     raised = int((lifted > used.weights).sum())
     used = dataclasses.replace(used, weights=lifted)

@@ -153,3 +153,21 @@ def mixed_areas(mesh):
                 sides = [((k + 1) % 3), ((k + 2) % 3)]
                 area[face[k]] += sum(edge[s] @ edge[s] * cot[s] for s in sides) / 8
     return area
+
+
+def strip_of_slivers(degrees):
+    """Return a band of 38 triangles with two angles like that."""
+    x = np.arange(20.0)
+    low = np.stack([x, 0 * x, 0 * x], axis=1)
+    high = low + np.array([0.5, np.tan(np.radians(degrees)), 0])
+    k = np.arange(19)
+    faces = [np.stack([k, k + 1, k + 20], 1), np.stack([k + 1, k + 21, k + 20], 1)]
+    return jd.Mesh(np.concatenate([low, high]), np.concatenate(faces))
+
+
+def test_biharmonic_weights_on_slivers_are_refused_with_the_reason():
+    """libigl raises a RuntimeError there, and its text names no reason."""
+    weights = jd.bounded_biharmonic_weights(strip_of_slivers(1e-5), [0, 19])
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=EXACT)
+    with pytest.raises(jd.InputError, match=r"some triangles are too thin: see jd\.inspect"):
+        jd.bounded_biharmonic_weights(strip_of_slivers(1e-7), [0, 19])

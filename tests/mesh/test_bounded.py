@@ -80,3 +80,13 @@ def test_precompute_names_the_cells_and_the_energy_stays_bounded():
         out = jd.deform(problem, targets, rigidity, solver=jd.QuasiNewton(max_steps=2000))
         assert float(out.energy[-1]) > -1e-9 * float(out.energy[0])
         assert np.abs(np.asarray(out.vertices) - mesh.vertices).max() < size
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.filterwarnings("ignore:negative weights")
+def test_weights_of_which_none_is_positive_are_refused_as_such(bar, value):
+    cells = jd.rings(bar, 1, weights=np.full(len(bar.edges), value))
+    with pytest.raises(jd.InputError, match="none of their 2160 edge weights is positive, so"):
+        jd.precompute(bar, [0, 721], cells=cells)
+    # Where every vertex is a handle, nothing has to hold the others.
+    assert jd.precompute(bar, np.arange(722), cells=cells).n_vertices == 722
