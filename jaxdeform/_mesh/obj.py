@@ -13,6 +13,7 @@ from jaxdeform._mesh.normals import corner_sides, corner_vectors
 from jaxdeform._mesh.parsed import Extras, Parsed
 from jaxdeform._mesh.polygons import Polygons, from_lists, unit
 from jaxdeform._mesh.words import (
+    PADDING,
     content,
     damaged,
     excerpt,
@@ -37,6 +38,12 @@ _COUNT = re.compile(rb"^# (Vertices|Faces): (\d{1,12})\s*$", re.MULTILINE)
 
 def parse_obj(path: Path, data: bytes) -> Parsed:
     """Read positions and polygons; know every keyword, skip what is no surface."""
+    text = data.rstrip(PADDING)
+    trailing = len(data) - len(text)
+    # Where a line was cut off, a disk may have put zeros.
+    if trailing and not text.endswith((b"\n", b"\r")):
+        raise damaged(path, "ends within a line")
+    data = text
     points: list[tuple[float, ...]] = []
     sizes: list[int] = []
     corners: list[int] = []
@@ -65,7 +72,7 @@ def parse_obj(path: Path, data: bytes) -> Parsed:
     if announced and not data.endswith((b"\n", b"\r")):
         raise damaged(path, "ends within a line")
     try:
-        return Parsed(stacked(points), from_lists(sizes, corners))
+        return Parsed(stacked(points), from_lists(sizes, corners), trailing)
     except OverflowError:
         raise damaged(path, "names a vertex out of range") from None
 

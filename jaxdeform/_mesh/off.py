@@ -16,6 +16,7 @@ from jaxdeform._mesh.words import (
     joined,
     polygon,
     position,
+    real,
     stacked,
     text_of,
     whole,
@@ -28,7 +29,7 @@ _FIRST_WORD = re.compile(rb"(ST)?(C?)(N?)OFF", re.IGNORECASE)
 
 def parse_off(path: Path, data: bytes) -> Parsed:
     """Read positions and polygons."""
-    lines = data.splitlines()
+    lines = _records(data)
     filled = _filled(lines)
     first = content(lines[filled[0]]) if filled else [b""]
     if not _FIRST_WORD.fullmatch(first[0]):
@@ -77,7 +78,7 @@ def to_off(points: np.ndarray, polygons: Polygons, extras: Extras) -> bytes:
 
 def rewrite_off(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
     """Return a file with other positions, and normals computed anew; all else stays."""
-    lines = data.splitlines(keepends=True)
+    lines = _records(data, keepends=True)
     filled = _filled(lines)
     first = _FIRST_WORD.fullmatch(content(lines[filled[0]])[0])
     rows = points
@@ -91,7 +92,7 @@ def rewrite_off(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
 
 def color_words(data: bytes) -> list[list[bytes]]:
     """Return the words of each vertex that say its colour and opacity, if there are colours."""
-    lines = data.splitlines()
+    lines = _records(data)
     filled = _filled(lines)
     words = content(lines[filled[0]])
     kind = _FIRST_WORD.fullmatch(words[0])
@@ -101,6 +102,54 @@ def color_words(data: bytes) -> list[list[bytes]]:
     begin = _body(lines, filled)
     at = 6 if kind[3] else 3
     return [content(lines[k])[at : at + 4] for k in filled[begin : begin + count]]
+
+
+def _records(data: bytes, keepends: bool = False) -> list[bytes]:
+    """Return the lines. Where records are not one a line, they are put so."""
+    lines = data.splitlines(keepends)
+    filled = _filled(lines)
+    first = content(lines[filled[0]]) if filled else []
+    head = first[1:] or (content(lines[filled[1]]) if len(filled) > 1 else [])
+    try:
+        n, m = whole(head[0]), whole(head[1])
+        body = filled[_body(lines, filled) :]
+        if _fill_lines(lines, body, n, m):
+            return lines
+        return _one_a_line([word for k in filled for word in content(lines[k])]) or lines
+    except (ValueError, IndexError):
+        return lines
+
+
+def _fill_lines(lines: list[bytes], body: list[int], n: int, m: int) -> bool:
+    """Return whether there is a line for each record, with as many words as it needs."""
+    if len(body) < n + m:
+        return False
+    if any(len(content(lines[k])) < 3 for k in body[:n]):
+        return False
+    faces = (content(lines[k]) for k in body[n : n + m])
+    return all(len(words) > whole(words[0]) for words in faces)
+
+
+def _one_a_line(words: list[bytes]) -> list[bytes] | None:
+    """Return the records, a line each, or None: the words are not just those records.
+
+    Colours end with their line, so that a file with colours has one.
+    """
+    kind = _FIRST_WORD.fullmatch(words[0])
+    if not kind or kind[1] or kind[2]:
+        return None
+    list(map(real, words[1:]))
+    n, m = whole(words[1]), whole(words[2])
+    width = 6 if kind[3] else 3
+    at = 4 + width * n
+    if min(n, m) < 0 or at > len(words):
+        return None
+    lines = [b" ".join(words[k : k + width]) for k in range(4, at, width)]
+    for _ in range(m):
+        end = at + 1 + max(whole(words[at]), 0)
+        lines.append(b" ".join(words[at:end]))
+        at = end
+    return [line + b"\n" for line in (b" ".join(words[:4]), *lines)] if at == len(words) else None
 
 
 def _filled(lines: list[bytes]) -> list[int]:

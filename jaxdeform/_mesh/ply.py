@@ -59,8 +59,7 @@ def _parse_body(path: Path, data: bytes, header: Header) -> tuple[dict, Polygons
             polygons = Polygons(field.sizes, field.take(data).astype(np.int64))
         trailing = len(data) - end
     else:
-        lines = data[header.size :].splitlines()
-        rows, behind = text_rows(path, lines, header)
+        lines, rows, behind = text_rows(path, data, header)
         trailing = sum(len(lines[k]) for k in behind)
         table = [_numbers(path, lines[k].split(), len(vertex.properties)) for k in rows["vertex"]]
         array = np.array(table, np.float64).reshape(-1, len(vertex.properties))
@@ -190,8 +189,7 @@ def _rewritten_binary(path, data, header, values, kinds, face_normals) -> bytes:
 
 
 def _rewritten_text(path, data, header, values, kinds, face_normals) -> bytes:
-    lines = data[header.size :].splitlines(keepends=True)
-    rows, _ = text_rows(path, lines, header)
+    lines, rows, _ = text_rows(path, data, header, keepends=True)
     vertex = header.vertex
     columns = {name: _texts(column, kinds[name], name) for name, column in values.items()}
     for row, k in enumerate(rows["vertex"]):

@@ -108,18 +108,70 @@ def _short(path: Path, element: Element) -> Exception:
     )
 
 
-def text_rows(path: Path, lines: list[bytes], header: Header) -> tuple[dict, list[int]]:
-    """Return which lines of the body each element has, and the lines behind the end."""
+class TextRows(NamedTuple):
+    """The lines of a text body."""
+
+    lines: list[bytes]
+    """One record each."""
+    rows: dict[str, list[int]]
+    """Which lines each element has."""
+    behind: list[int]
+    """The lines behind the end."""
+
+
+def text_rows(path: Path, data: bytes, header: Header, keepends: bool = False) -> TextRows:
+    """Return the lines of the body. Where records are not one a line, they are put so."""
+    lines = data[header.size :].splitlines(keepends)
     filled = [k for k, line in enumerate(lines) if line.strip()]
+    counts = [element.count if element.properties else 0 for element in header.elements]
+    if not _fill_lines(lines, filled, header):
+        flowing = _one_a_line(data, header)
+        if flowing:
+            lines, filled = flowing, list(range(len(flowing)))
     rows: dict[str, list[int]] = {}
     at = 0
-    for element in header.elements:
-        count = element.count if element.properties else 0
+    for element, count in zip(header.elements, counts, strict=True):
         rows[element.name] = filled[at : at + count]
         at += count
         if at > len(filled):
             raise damaged(path, f"announces {count} of '{element.name}' but holds fewer")
-    return rows, filled[at:]
+    return TextRows(lines, rows, filled[at:])
+
+
+def _fill_lines(lines: list[bytes], filled: list[int], header: Header) -> bool:
+    """Return whether there is a line for each record, with as many words as it needs."""
+    at = 0
+    try:
+        for element in header.elements:
+            count = element.count if element.properties else 0
+            if at + count > len(filled):
+                return False
+            for k in filled[at : at + count]:
+                words = lines[k].split()
+                if text_place(words, element, "") > len(words):
+                    return False
+            at += count
+    except (ValueError, IndexError):
+        return False
+    return True
+
+
+def _one_a_line(data: bytes, header: Header) -> list[bytes] | None:
+    """Return the records of a body, a line each, or None: its words are not just those records."""
+    words = data[header.size :].split()
+    lines, at = [], 0
+    try:
+        for element in header.elements:
+            for _ in range(element.count if element.properties else 0):
+                begin = at
+                for item in element.properties:
+                    at += 1 + max(whole(words[at]), 0) if item.count else 1
+                if at > len(words):
+                    return None
+                lines.append(b" ".join(words[begin:at]) + header.line_end)
+    except (ValueError, IndexError):
+        return None
+    return lines if at == len(words) else None
 
 
 def text_place(words: list[bytes], element: Element, name: str) -> int:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdeform._errors import InputError
-from jaxdeform._mesh.words import damaged, whole
+from jaxdeform._mesh.words import damaged, excerpt, whole
 
 INTEGERS = {
     **dict.fromkeys((b"char", b"int8"), "i1"),
@@ -17,6 +17,9 @@ INTEGERS = {
     **dict.fromkeys((b"ushort", b"uint16"), "u2"),
     **dict.fromkeys((b"int", b"int32"), "i4"),
     **dict.fromkeys((b"uint", b"uint32"), "u4"),
+    # Not in the format's first description, but programs write them.
+    b"int64": "i8",
+    b"uint64": "u8",
 }
 _KINDS = {
     **INTEGERS,
@@ -98,13 +101,13 @@ def parse_header(path: Path, data: bytes) -> Header:
             elif keyword == b"element":
                 elements.append(Element(_name(words[1]), whole(words[2]), []))
             elif keyword == b"property":
-                elements[-1].properties.append(_property(words, number))
+                elements[-1].properties.append(_property(path, words, number))
             elif keyword not in (b"", b"ply", b"comment", b"obj_info"):
                 raise InputError(
                     f"{path}: line {number + 1} of its header begins with an unknown word: the "
                     "words are format, comment, element and property"
                 )
-    except (KeyError, IndexError, ValueError) as error:
+    except (IndexError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise damaged(path, "has a PLY header without vertices and faces") from None
@@ -117,11 +120,20 @@ def _name(word: bytes) -> str:
     return word.decode("utf-8", "backslashreplace")
 
 
-def _property(words: list[bytes], number: int) -> Property:
+def _property(path: Path, words: list[bytes], number: int) -> Property:
+    def kind(word: bytes, known: dict[bytes, str]) -> str:
+        if word.lower() not in known:
+            raise InputError(
+                f"{path}: line {number + 1} of its header {excerpt(words)} has the type "
+                f"{excerpt([word])}, which cannot be read there: export it with "
+                f"{'int or uchar' if known is INTEGERS else 'float, double or int'}"
+            )
+        return known[word.lower()]
+
     if words[1].lower() == b"list":
-        kinds = INTEGERS[words[2].lower()], _KINDS[words[3].lower()]
-        return Property(_name(words[4]), kinds[1], kinds[0], number)
-    return Property(_name(words[2]), _KINDS[words[1].lower()], "", number)
+        count, item = kind(words[2], INTEGERS), kind(words[3], _KINDS)
+        return Property(_name(words[4]), item, count, number)
+    return Property(_name(words[2]), kind(words[1], _KINDS), "", number)
 
 
 def _check(path: Path, header: Header) -> None:

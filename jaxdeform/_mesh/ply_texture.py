@@ -40,10 +40,10 @@ def _lists(
     if header.order:
         field: Field = binary_fields(path, data, header)[0]["face", TEXTURE]
         return field.sizes, field.take(data).astype(np.float64)
-    lines = data[header.size :].splitlines()
+    lines, rows, _ = text_rows(path, data, header)
     sizes: list[int] = []
     values: list[float] = []
-    for k in text_rows(path, lines, header)[0]["face"]:
+    for k in rows["face"]:
         words = lines[k].split()
         at = text_place(words, face, TEXTURE)
         sizes.append(whole(words[at]))

@@ -15,13 +15,23 @@ from jaxdeform._mesh.polygons import (
     from_triangles,
     unit,
 )
-from jaxdeform._mesh.words import content, damaged, excerpt, position, stacked, text_of, with_words
+from jaxdeform._mesh.words import (
+    PADDING,
+    content,
+    damaged,
+    excerpt,
+    position,
+    stacked,
+    text_of,
+    with_words,
+)
 
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 _HEAD = 84
 
 # Lines that stay as they are.
 _KEPT = frozenset(b"solid outer endloop endsolid color".split())
+_KNOWN = _KEPT | {b"facet", b"vertex", b"endfacet"}
 
 
 def parse_stl(path: Path, data: bytes) -> Parsed:
@@ -35,8 +45,7 @@ def parse_stl(path: Path, data: bytes) -> Parsed:
         corners = np.frombuffer(data, _FACET, count, _HEAD)["corners"].reshape(-1, 3)
         polygons = from_triangles(np.arange(3 * count).reshape(-1, 3))
     elif data.lstrip()[:5].lower() == b"solid":
-        corners, polygons = _parse_text(path, data)
-        behind = 0
+        corners, polygons, behind = _parse_text(path, data)
     else:
         raise damaged(path, "is neither ASCII STL nor as long as its face count says")
     if not len(corners):
@@ -54,15 +63,25 @@ def is_binary(data: bytes) -> bool:
     return 0 < _count(data) * _FACET.itemsize <= len(data) - _HEAD
 
 
-def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"], Polygons]:
+def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"], Polygons, int]:
     corners: list[tuple[float, ...]] = []
     sizes: list[int] = []
     facets, used, last = 0, 0, b""
+    behind, unknown = 0, None
+    data = data.rstrip(PADDING)
     for number, line in enumerate(data.splitlines(), 1):
         words = content(line)
         if not words:
             continue
-        last = words[0].lower()
+        keyword = words[0].lower()
+        if last == b"endsolid" and keyword not in _KNOWN:
+            # Behind the end may stand anything, but no further faces.
+            behind += len(line)
+            unknown = unknown or _unknown(path, number, words)
+            continue
+        if unknown:
+            raise unknown
+        last = keyword
         if last == b"vertex":
             corners.append(position(path, number, words[1:]))
         elif last == b"facet":
@@ -73,15 +92,19 @@ def _parse_text(path: Path, data: bytes) -> tuple[Float[np.ndarray, "corners 3"]
             if sizes[-1] < 3:
                 raise damaged(path, f"face {len(sizes) - 1} is a face with {sizes[-1]} corners")
         elif last not in _KEPT:
-            raise InputError(
-                f"{path}: line {number} {excerpt(words)} begins with an unknown keyword: correct "
-                "it, or put # before it"
-            )
+            raise _unknown(path, number, words)
     if last != b"endsolid":
         raise damaged(path, "does not end with endsolid")
     if used != len(corners) or facets != len(sizes):
         raise damaged(path, "has a face that does not end with endfacet")
-    return stacked(corners), from_lists(sizes, list(range(used)))
+    return stacked(corners), from_lists(sizes, list(range(used))), behind
+
+
+def _unknown(path: Path, number: int, words: list[bytes]) -> InputError:
+    return InputError(
+        f"{path}: line {number} {excerpt(words)} begins with an unknown keyword: correct it, or "
+        "put # before it"
+    )
 
 
 def to_stl(points: np.ndarray, polygons: Polygons, extras: Extras) -> bytes:

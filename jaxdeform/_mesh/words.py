@@ -10,6 +10,9 @@ from jaxtyping import Float
 
 from jaxdeform._errors import InputError, shown
 
+# Zeros, or the sign of DOS for the end, behind the end of a text, as old programs leave them.
+PADDING = b"\0\x1a"
+
 _WORD = re.compile(rb"[^\s\\]+")
 
 

@@ -61,8 +61,15 @@ BAD_FILES = {
     ),
     "kind.ply": (
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nelement face 1\nend_header\n",
-        "without vertices",
+        "line 4 of its header 'property quad x' has the type 'quad', which cannot be read there",
     ),
+    "nul.obj": (b"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\0\0", "ends within a line"),
+    "behind.stl": (
+        (ONE_FACET + "hello\n" + ONE_FACET).encode(),
+        "line 8 'hello' begins with an unknown keyword",
+    ),
+    "flow.off": (b"OFF 3 1 0 0 0 0 1 0 0 0 1 0 3 0 1", "holds fewer"),
+    "flow more.off": (b"OFF 3 1 0 0 0 0 1 0 0 0 1 0 3 0 1 2 7", "holds fewer"),
     "cloud.ply": (
         b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
         b"property float z\nend_header\n0 0 0\n1 0 0\n",

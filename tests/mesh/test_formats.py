@@ -180,3 +180,70 @@ def test_a_georeferenced_scan_loses_no_digit(tmp_path, suffix):
     v = np.array([412_345.678, 5_654_321.123, 87.5]) + rng.integers(0, 1000, (3, 3)) / 1000
     jd.save_mesh(tmp_path / f"m{suffix}", jd.Mesh(v, [[0, 1, 2]]))
     assert jd.load_mesh(tmp_path / f"m{suffix}").vertices.tobytes() == v.tobytes()
+
+
+PLY_HEAD = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int64 vertex_indices
+end_header
+"""
+FLOWING = {
+    "one.off": "OFF 3 1 0 0 0 0 1 0 0 0 1 0 3 0 1 2",
+    "two.off": "OFF # by hand\n3 1 3\n0 0 0 1 0 0\n0 1\n0 3 0\n1 2\n",
+    "normals.off": "NOFF 3 1 0 0 0 0 0 0 1 1 0 0 0 0 1 0 1 0 0 0 1 3 0 1 2",
+    "one.ply": PLY_HEAD + "0 0 0 1 0 0 0 1 0 3 0 1 2",
+    "two.ply": PLY_HEAD + "0 0\n0 1 0 0\n0 1 0 3\n0 1\n2\n",
+}
+
+
+@pytest.mark.parametrize("name", FLOWING)
+def test_records_need_not_have_lines_of_their_own(tmp_path, name):
+    path = tmp_path / name
+    path.write_text(FLOWING[name])
+    mesh = jd.load_mesh(path)
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+    out = tmp_path / f"out{path.suffix}"
+    jd.save_mesh(out, mesh)
+    assert out.read_bytes() == path.read_bytes()
+    jd.save_mesh(out, mesh, vertices=mesh.vertices + 1)
+    assert jd.load_mesh(out).vertices.tolist() == [[1, 1, 1], [2, 1, 1], [1, 2, 1]]
+    # Less of it is no other mesh.
+    for size in range(len(FLOWING[name].rstrip()) - 1):
+        path.write_text(FLOWING[name][:size])
+        with pytest.raises(jd.InputError):
+            jd.load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "behind"),
+    [
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "\0\0"),
+        ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "\0\0"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "\x1a"),
+        ("m.stl", ONE_FACET, "\0\0"),
+        ("m.stl", ONE_FACET, "made by hand\n"),
+    ],
+)
+def test_what_stands_behind_the_end_of_a_text(tmp_path, name, text, behind):
+    path = tmp_path / name
+    path.write_text(text + behind)
+    mesh = jd.load_mesh(path)
+    assert mesh.vertices[mesh.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    jd.save_mesh(path, mesh, vertices=mesh.vertices + 1)
+    assert path.read_text().endswith(behind)
+    assert jd.load_mesh(path).vertices.tolist() == (mesh.vertices + 1).tolist()
+
+
+@pytest.mark.parametrize("kind", ["int64", "uint64"])
+def test_binary_ply_with_wide_integers(tmp_path, kind):
+    head = PLY_HEAD.replace("ascii", "binary_little_endian").replace("int64", kind)
+    path = tmp_path / "m.ply"
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    path.write_bytes(head.encode() + points.tobytes() + b"\3" + np.arange(3, dtype="<i8").tobytes())
+    assert jd.load_mesh(path).faces.tolist() == [[0, 1, 2]]
