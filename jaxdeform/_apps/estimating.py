@@ -64,14 +64,11 @@ def estimate(
     report = _check_names(out)
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
     label = choose_parts(parts, part or [], shape)
-    if handles:
-        index = jd.load_handles(handles, shape).handles
-    else:
-        index = _moved_rigidly(shape, observed, tolerance)
+    known = jd.load_handles(handles, shape).handles if handles else None
+    index = _moved_rigidly(shape, observed, tolerance) if known is None else known
     began = time.perf_counter()
-    problem = patiently(
-        "precomputing", lambda: jd.precompute(shape, index, cells=jd.rings(shape, rings))
-    )
+    cells = jd.rings(shape, rings)
+    problem = patiently("precomputing", lambda: jd.precompute(shape, index, cells=cells))
     fitted, kept = np.split(observed, [len(poses) - hold_out])
     fit = _fit(problem, fitted, label, steps)
     failed = _saved(out, report, shape, fit, index)

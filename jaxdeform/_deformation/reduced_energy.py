@@ -70,6 +70,7 @@ class ReducedEnergy:
         else:
             # B enters a law as T B only, so its change acts like one of C. The change is 0 in
             # value, so T is right to one order more each time: twice for second derivatives.
+            assert transforms is not None  # a geometry is given for derivatives only
             change, t = at.moment_change(), transforms
             for _ in range(2):
                 push = jnp.einsum("jik,lik->jlk", change, t)

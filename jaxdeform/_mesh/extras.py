@@ -1,5 +1,6 @@
 """Colours and texture coordinates of a file, to be drawn, or written into another format."""
 
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,11 +9,24 @@ from jaxtyping import Float
 
 from jaxdeform._mesh.obj import color_words as obj_words
 from jaxdeform._mesh.obj import corner_texture as obj_texture
+from jaxdeform._mesh.obj import keywords as obj_keywords
 from jaxdeform._mesh.off import color_words as off_words
+from jaxdeform._mesh.off import has_face_colors
 from jaxdeform._mesh.parsed import Extras, Source
 from jaxdeform._mesh.ply import vertex_columns, vertex_kinds
+from jaxdeform._mesh.ply_header import parse_header
 from jaxdeform._mesh.ply_texture import corner_texture as ply_texture
 from jaxdeform._mesh.reading import without_mark
+
+# What every format holds, or is made anew, or goes along into a PLY.
+_PLY_KNOWN = {
+    "vertex": {
+        *("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"),
+        *("s", "t", "u", "v", "texture_u", "texture_v"),
+    },
+    "face": {"vertex_indices", "vertex_index", "texcoord"},
+    "tristrips": {"vertex_indices", "vertex_index"},
+}
 
 
 def file_extras(source: Source | None) -> Extras:
@@ -79,3 +93,27 @@ def _file_texture(source: Source) -> Float[np.ndarray, "corners 2"] | None:
     read = {".ply": ply_texture, ".obj": obj_texture}.get(source.suffix)
     found = read(without_mark(source.data), source.polygons) if read else None
     return None if found is None or np.isnan(found).all() else found
+
+
+def of_own_format(source: Source | None) -> list[str]:
+    """Return in words what the file holds and only its own format is written with."""
+    if source is None:
+        return []
+    data = without_mark(source.data)
+    if source.suffix == ".obj":
+        used = Counter(obj_keywords(data))
+        groups = ["groups"] if used[b"g"] + used[b"o"] > 1 else []  # one is the whole mesh
+        materials = ["materials"] if used[b"usemtl"] else []
+        some = file_colors(source) is None and any(obj_words(data))
+        return [*groups, *materials, *(["colours of some vertices"] if some else [])]
+    if source.suffix == ".off":
+        return ["colours of faces"] if has_face_colors(data) else []
+    if source.suffix == ".ply":
+        header = parse_header(Path("its source"), data)
+        return [
+            f"{item.name} {name}"
+            for item in header.elements
+            for name in item.names()
+            if name not in _PLY_KNOWN.get(item.name, ())
+        ]
+    return []

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_rigidity, check_type, read_path
-from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._mesh.extras import file_extras
+from jaxdeform._errors import ArrayLike, InputError, printable
+from jaxdeform._mesh.extras import file_extras, of_own_format
 from jaxdeform._mesh.formats import FORMATS
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.parsed import Extras, Source
@@ -177,11 +177,13 @@ def _extras(path: Path, suffix: str, source: Source | None) -> Extras:
     names = {"colors": "colours", "texture": "texture coordinates"}
     holds = FORMATS[suffix].holds
     had = [name for name in names if getattr(found, name) is not None]
-    lost = [names[name] for name in had if name not in holds]
+    lost = [names[name] for name in had if name not in holds] + of_own_format(source)
     if lost:
+        shown = [printable(name) for name in lost[:8]] + ["..."] * (len(lost) > 8)
+        text = " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
         warnings.warn(
-            f"{path}: {suffix[1:].upper()} cannot hold the {' and '.join(lost)} of the file that "
-            "the mesh was read from: they are not written; PLY and OBJ hold them",
+            f"{path}: {suffix[1:].upper()} cannot hold the {text} of the file that the mesh was "
+            "read from: they are not written",
             stacklevel=4,
         )
     return found

@@ -181,8 +181,13 @@ def _lines(path: Path | None, data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def color_words(data: bytes) -> list[list[bytes]]:
     """Return the words behind the position of each vertex."""
-    rows = (line.split() for line in data.splitlines() if line.lstrip().startswith(b"v"))
-    return [row[4:7] for row in rows if row[0] == b"v"]
+    rows = (content(_plain(line)) for _, line in _lines(None, data))
+    return [row[4:7] for row in rows if _keyword(row) == b"v"]
+
+
+def keywords(data: bytes) -> list[bytes]:
+    """Return the keyword of each line, in small letters."""
+    return [_keyword(_plain(line).split(None, 1)[:1]) for _, line in _lines(None, data)]
 
 
 def corner_texture(data: bytes, polygons: Polygons) -> Float[np.ndarray, "corners 2"] | None:

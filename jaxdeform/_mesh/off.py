@@ -104,6 +104,16 @@ def color_words(data: bytes) -> list[list[bytes]]:
     return [content(lines[k])[at : at + 4] for k in filled[begin : begin + count]]
 
 
+def has_face_colors(data: bytes) -> bool:
+    """Return whether a face says more than its corners."""
+    lines = _records(data)
+    filled = _filled(lines)
+    words = content(lines[filled[0]])[1:] or content(lines[filled[1]])
+    begin, n, m = _body(lines, filled), whole(words[0]), whole(words[1])
+    faces = (content(lines[k]) for k in filled[begin + n : begin + n + m])
+    return any(len(face) > 1 + whole(face[0]) for face in faces)
+
+
 def _records(data: bytes, keepends: bool = False) -> list[bytes]:
     """Return the lines. Where records are not one a line, they are put so."""
     lines = data.splitlines(keepends)

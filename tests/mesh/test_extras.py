@@ -138,3 +138,52 @@ def test_a_file_without_them_gives_none(tmp_path, name):
     there = jd.load_mesh(CASES / name)
     assert file_extras(there.source) == (None, None)
     assert file_extras(through(there, tmp_path / "m.ply").source) == (None, None)
+
+
+# ---------------------------------------------------------------- what only one format holds
+
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property float quality
+element face 1
+property list uchar int vertex_indices
+property uchar red
+end_header
+0 0 0 1
+1 0 0 2
+0 1 0 3
+3 0 1 2 9
+"""
+ONE_FORMAT = {
+    "m.obj": (
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\ng a\nusemtl b\nf 1 2 3\ng c\nf 3 2 1\n",
+        "groups and materials",
+    ),
+    "some.obj": ("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "colours of some vertices"),
+    "m.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 255 0 0\n", "colours of faces"),
+    "m.ply": (PLY, "vertex quality and face red"),
+}
+
+
+@pytest.mark.parametrize("name", ONE_FORMAT)
+def test_what_only_its_own_format_holds_is_said(name, tmp_path, recwarn):
+    text, lost = ONE_FORMAT[name]
+    (tmp_path / name).write_text(text)
+    mesh = jd.load_mesh(tmp_path / name)
+    jd.save_mesh(tmp_path / f"moved_{name}", mesh, vertices=mesh.vertices + 1)
+    assert not recwarn.list
+    other = "o.ply" if name.endswith(".obj") else "o.obj"
+    with pytest.warns(UserWarning, match=f"cannot hold the {lost} of the file"):
+        jd.save_mesh(tmp_path / other, mesh)
+
+
+def test_colours_of_an_obj_with_any_keyword_and_over_lines(tmp_path):
+    text = OBJ.replace("v 1 1 0 0 0 0", "V 1 1 0 \\\n0 0 0", 1)
+    (tmp_path / "m.obj").write_text(text)
+    np.testing.assert_array_equal(
+        file_extras(jd.load_mesh(tmp_path / "m.obj").source).colors, COLORS
+    )
