@@ -16,7 +16,7 @@ from benchmarks.workloads import Workload
 from jaxdeform._linalg.factor_cache import factors
 
 CONSTANTS = (10.0, 0.2, 0.01)
-MOST = 5000
+MOST = 3000
 
 
 def run(quick: bool) -> Findings:
@@ -47,7 +47,7 @@ def _descent(load: Workload) -> list[Metric]:
     constants = {x: jd.rigidity_from_material(problem, x) for x in CONSTANTS}
     cases = [Case(f"constant {x:g}", problem, r, jd.Newton(), 0.05) for x, r in constants.items()]
     with Cgal(load.mesh, load.handles, load.targets) as cgal:
-        steps = _steps_of(cgal, load, rigid)
+        steps, above = _steps_of(cgal, load, rigid)
 
         def theirs() -> None:
             cgal.reset()
@@ -59,8 +59,8 @@ def _descent(load: Workload) -> list[Metric]:
             runs[f"{case.name} and factors"] = _with_factors(load, case)
         seconds = interleaved(runs, 5)
         prepared = seconds["CGAL"] + cgal.seconds_to_prepare
-    out = [Metric("time to within 1e-4, CGAL", load.name, seconds["CGAL"], "s",
-                  note=f"{steps} iterations")]  # fmt: skip
+    note = f"{steps} iterations, ending {100 * above:.2g} % above our rigid minimum"
+    out = [Metric("time to within 1e-4, CGAL", load.name, seconds["CGAL"], "s", note=note)]
     for case in cases:
         label = f"time to within 1e-4 of the minimum, {case.name} / CGAL's rigid ARAP"
         ratio = seconds[case.name] / seconds["CGAL"]
@@ -70,16 +70,21 @@ def _descent(load: Workload) -> list[Metric]:
     return out
 
 
-def _steps_of(cgal: Cgal, load: Workload, problem: jd.Problem) -> int:
-    """Return CGAL's iterations until it is near the minimum, in tens."""
+def _steps_of(cgal: Cgal, load: Workload, problem: jd.Problem) -> tuple[int, float]:
+    """Return CGAL's iterations until it is near its end, in tens, and how far that is above ours.
+
+    Its end is the minimum, or what it reaches in ``MOST`` iterations. Both as our functional of
+    rigid cells says, and the distance as a fraction of the minimum's energy.
+    """
     local = jd.RotationFit()
     least = float(energies_of(load, problem, 0.0, local)[-1])
-    for steps in range(10, MOST + 1, 10):
+    energies = []
+    for _ in range(0, MOST, 10):
         cgal.deform(10)
-        energy = load.reduced_energy(problem, cgal.vertices(), 0.0, local)
-        if energy <= least * (1.0 + NEAR):
-            return steps
-    raise RuntimeError(f"CGAL does not come near the minimum of {load.name} in {MOST} iterations")
+        energies.append(load.reduced_energy(problem, cgal.vertices(), 0.0, local))
+    end = min(energies)
+    first = next(k for k, x in enumerate(energies) if x <= max(least, end) * (1.0 + NEAR))
+    return 10 * (first + 1), end / least - 1.0
 
 
 def _with_factors(load: Workload, case: Case) -> Callable[[], object]:
