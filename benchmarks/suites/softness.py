@@ -47,14 +47,18 @@ def _evaluations(load: Workload, problem: jd.Problem, constant: float, target) -
         Metric(
             f"evaluations to {NEAR:g} of the minimum, {metric}",
             where,
-            float(np.argmax(energy <= least * (1 + NEAR)))
-            if energy[-1] <= least * (1 + NEAR)
-            else np.inf,
+            _evaluations_to(energy, least),
             "evaluations",
             target if metric == "material" else None,
         )
         for metric, energy in ways.items()
     ]
+
+
+def _evaluations_to(energy: np.ndarray, least: float) -> float:
+    """Return how many evaluations it takes to come near the least energy."""
+    near = energy <= least * (1 + NEAR)
+    return float(np.argmax(near)) if near[-1] else np.inf
 
 
 def _cost_of_telling(load: Workload) -> Metric:
@@ -86,7 +90,7 @@ def _coarse_start(load: Workload, constant: float) -> list[Metric]:
         return jd.deform(problem, load.targets, rigidity, start=start, solver=solver)
 
     energy = {x: np.asarray(descend(x, 2000).energy) for x in (True, False)}
-    steps = {x: int(np.argmax(e <= e[-1] * (1 + NEAR))) for x, e in energy.items()}
+    steps = {x: int(_evaluations_to(e, e[-1])) for x, e in energy.items()}
     runs = {
         str(x): lambda x=x: descend(x, max(steps[x], 1), 0.0).vertices.block_until_ready()
         for x in (True, False)

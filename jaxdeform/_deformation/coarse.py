@@ -26,6 +26,7 @@ from jaxdeform._checks import check_count
 from jaxdeform._deformation.arguments import from_center, read_inputs
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_blocks, stiffness
 from jaxdeform._deformation.local_step import LocalStep, Newton
+from jaxdeform._deformation.metric import compliance
 from jaxdeform._deformation.problem import Problem, check_problem, precompute
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs
@@ -211,11 +212,9 @@ def _thinner(problem: Problem, alpha: float) -> Problem:
     moments, axes = principal_moments(cells)
     blocks = covariance_blocks(cells, rest, axes, size)
     matrix = alpha * enlarge(stiffness(cells), size)
+    inverse = fill_up(compliance(moments.T, np.zeros(len(moments))), size)
     for axis in (1, 2):
-        b = np.maximum(moments[:, axis], 0.0)
-        flat = b <= 1e-9 * b.max()
-        inverse = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, b))
-        fit = sp.diags(fill_up(inverse, size)) @ blocks[axis]
+        fit = sp.diags(inverse[axis]) @ blocks[axis]
         matrix = matrix + (1.0 - alpha) * (blocks[axis].T @ fit)
     matrix = sp.csr_matrix(matrix + sp.diags(np.asarray(problem.system.soft)))
     free = np.asarray(problem.system.free)

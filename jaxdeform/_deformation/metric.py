@@ -197,8 +197,8 @@ def _make(rigidity: np.ndarray, parts: _Parts, dtype: np.dtype) -> HostFactor:
         n = len(parts.free)
         excess = np.asarray(pull.sum(axis=1)).ravel()
         pull = pull - sp.csr_matrix((excess, (np.arange(3 * n), np.tile(np.arange(n), 3))))
-    compliance = _compliance(parts.moments, _rounded_up(rigidity)).ravel()
-    softened = pull.T @ sp.diags(compliance) @ pull
+    inverse = compliance(parts.moments, _rounded_up(rigidity)).ravel()
+    softened = pull.T @ sp.diags(inverse) @ pull
     for mix in _FLOAT32_MIXES if dtype == np.float32 else _MIXES:
         matrix = Matrix.of(stiffness - (1.0 - mix) * softened, parts.free)
         try:
@@ -208,7 +208,7 @@ def _make(rigidity: np.ndarray, parts: _Parts, dtype: np.dtype) -> HostFactor:
     return HostFactor.of(parts.stiffness, dtype)
 
 
-def _compliance(moments: np.ndarray, rigidity: np.ndarray) -> np.ndarray:
+def compliance(moments: np.ndarray, rigidity: np.ndarray) -> np.ndarray:
     """Return the mean of 1 / b and 1 / (b + 4 lambda), (3, cells); 0 along axes without extent."""
     b = np.maximum(moments.astype(np.float64), 0.0)
     flat = b <= 1e-9 * b.max(axis=0)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxdeform._mesh.obj import all_keywords as obj_keywords
 from jaxdeform._mesh.obj import color_words as obj_words
 from jaxdeform._mesh.obj import corner_texture as obj_texture
-from jaxdeform._mesh.obj import keywords as obj_keywords
 from jaxdeform._mesh.off import color_words as off_words
 from jaxdeform._mesh.off import has_face_colors
 from jaxdeform._mesh.parsed import Extras, Source
@@ -95,8 +95,8 @@ def _file_texture(source: Source) -> Float[np.ndarray, "corners 2"] | None:
     return None if found is None or np.isnan(found).all() else found
 
 
-def of_own_format(source: Source | None) -> list[str]:
-    """Return in words what the file holds and only its own format is written with."""
+def of_own_format(source: Source | None, found: Extras) -> list[str]:
+    """Return in words what, besides its extras, only the file's own format is written with."""
     if source is None:
         return []
     data = without_mark(source.data)
@@ -104,7 +104,7 @@ def of_own_format(source: Source | None) -> list[str]:
         used = Counter(obj_keywords(data))
         groups = ["groups"] if used[b"g"] + used[b"o"] > 1 else []  # one is the whole mesh
         materials = ["materials"] if used[b"usemtl"] else []
-        some = file_colors(source) is None and any(obj_words(data))
+        some = found.colors is None and any(obj_words(data))
         return [*groups, *materials, *(["colours of some vertices"] if some else [])]
     if source.suffix == ".off":
         return ["colours of faces"] if has_face_colors(data) else []

@@ -177,7 +177,7 @@ def _extras(path: Path, suffix: str, source: Source | None) -> Extras:
     names = {"colors": "colours", "texture": "texture coordinates"}
     holds = FORMATS[suffix].holds
     had = [name for name in names if getattr(found, name) is not None]
-    lost = [names[name] for name in had if name not in holds] + of_own_format(source)
+    lost = [names[name] for name in had if name not in holds] + of_own_format(source, found)
     if lost:
         shown = [printable(name) for name in lost[:8]] + ["..."] * (len(lost) > 8)
         text = " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)

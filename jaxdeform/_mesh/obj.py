@@ -114,8 +114,7 @@ def rewrite_obj(data: bytes, points: np.ndarray, polygons: Polygons) -> bytes:
     One ``vn`` may serve many vertices, whose normals were equal and are no longer so. Then further
     ``vn`` lines follow the last one, and the ``f`` lines name them.
     """
-    lines = [line for _, line in _lines(None, data)]
-    keywords = [_keyword(_plain(line).split(None, 1)[:1]) for line in lines]
+    lines, keywords = _keyed_lines(data)
     rows = iter(points.tolist())
     out = [
         with_words(line, 1, text_of(next(rows))) if keyword == b"v" else line
@@ -179,21 +178,26 @@ def _lines(path: Path | None, data: bytes) -> Iterator[tuple[int, bytes]]:
         yield len(lines), b"".join(open_)
 
 
+def _keyed_lines(data: bytes) -> tuple[list[bytes], list[bytes]]:
+    """Return the lines, those that go on as one, and the keyword of each."""
+    lines = [line for _, line in _lines(None, data)]
+    return lines, [_keyword(_plain(line).split(None, 1)[:1]) for line in lines]
+
+
 def color_words(data: bytes) -> list[list[bytes]]:
     """Return the words behind the position of each vertex."""
     rows = (content(_plain(line)) for _, line in _lines(None, data))
     return [row[4:7] for row in rows if _keyword(row) == b"v"]
 
 
-def keywords(data: bytes) -> list[bytes]:
+def all_keywords(data: bytes) -> list[bytes]:
     """Return the keyword of each line, in small letters."""
-    return [_keyword(_plain(line).split(None, 1)[:1]) for _, line in _lines(None, data)]
+    return _keyed_lines(data)[1]
 
 
 def corner_texture(data: bytes, polygons: Polygons) -> Float[np.ndarray, "corners 2"] | None:
     """Return the texture coordinates of each corner; NaN where it names none."""
-    lines = [line for _, line in _lines(None, data)]
-    keywords = [_keyword(_plain(line).split(None, 1)[:1]) for line in lines]
+    lines, keywords = _keyed_lines(data)
     named = _named(keywords, lines, b"vt", 1)
     words = [
         content(_plain(line))[1:3]

@@ -37,7 +37,7 @@ def parse_off(path: Path, data: bytes) -> Parsed:
     if first[1:2] and first[1].lower() == b"binary":
         raise InputError(f"{path}: is a binary OFF file: export it as text")
     begin = _body(lines, filled)
-    head = first[1:] or (content(lines[filled[1]]) if len(filled) > 1 else [])
+    head = _head(lines, filled)
     try:
         n, m = whole(head[0]), whole(head[1])
     except (IndexError, ValueError):
@@ -98,7 +98,7 @@ def color_words(data: bytes) -> list[list[bytes]]:
     kind = _FIRST_WORD.fullmatch(words[0])
     if not kind or not kind[2]:
         return []
-    count = whole((words[1:] or content(lines[filled[1]]))[0])
+    count = whole(_head(lines, filled)[0])
     begin = _body(lines, filled)
     at = 6 if kind[3] else 3
     return [content(lines[k])[at : at + 4] for k in filled[begin : begin + count]]
@@ -108,8 +108,7 @@ def has_face_colors(data: bytes) -> bool:
     """Return whether a face says more than its corners."""
     lines = _records(data)
     filled = _filled(lines)
-    words = content(lines[filled[0]])[1:] or content(lines[filled[1]])
-    begin, n, m = _body(lines, filled), whole(words[0]), whole(words[1])
+    begin, n, m = _body(lines, filled), *map(whole, _head(lines, filled)[:2])
     faces = (content(lines[k]) for k in filled[begin + n : begin + n + m])
     return any(len(face) > 1 + whole(face[0]) for face in faces)
 
@@ -118,9 +117,8 @@ def _records(data: bytes, keepends: bool = False) -> list[bytes]:
     """Return the lines. Where records are not one a line, they are put so."""
     lines = data.splitlines(keepends)
     filled = _filled(lines)
-    first = content(lines[filled[0]]) if filled else []
-    head = first[1:] or (content(lines[filled[1]]) if len(filled) > 1 else [])
     try:
+        head = _head(lines, filled)
         n, m = whole(head[0]), whole(head[1])
         body = filled[_body(lines, filled) :]
         if _fill_lines(lines, body, n, m):
@@ -169,6 +167,12 @@ def _filled(lines: list[bytes]) -> list[int]:
         for k, line in enumerate(lines)
         if (line if b"#" not in line else line.split(b"#", 1)[0]).strip()
     ]
+
+
+def _head(lines: list[bytes], filled: list[int]) -> list[bytes]:
+    """Return the words of the counts: behind the first word, or on the next line."""
+    behind = content(lines[filled[0]])[1:]
+    return behind or (content(lines[filled[1]]) if len(filled) > 1 else [])
 
 
 def _body(lines: list[bytes], filled: list[int]) -> int:
