@@ -50,7 +50,6 @@ def test_the_next_process_finds_the_programs_and_damage_is_mended(tmp_path):
     entries = sorted(Path(place).glob("*-cache"))
     assert entries
     assert found == 0
-    sizes = [entry.stat().st_size for entry in entries]
     _, found, second, _ = child("", JAXDEFORM_CACHE_DIR=str(tmp_path / "new" / "folder"))
     assert found >= len(entries)
     assert second == first
@@ -60,7 +59,9 @@ def test_the_next_process_finds_the_programs_and_damage_is_mended(tmp_path):
     _, found, third, _ = child("", JAXDEFORM_CACHE_DIR=str(tmp_path / "new" / "folder"))
     assert found == 0
     assert third == first
-    assert [entry.stat().st_size for entry in entries] == pytest.approx(sizes, rel=0.01)
+    _, found, fourth, _ = child("", JAXDEFORM_CACHE_DIR=str(tmp_path / "new" / "folder"))
+    assert found >= len(entries)
+    assert fourth == first
 
 
 def test_the_oldest_go_when_the_folder_is_full(tmp_path, monkeypatch):
