@@ -4,6 +4,7 @@ import operator
 from functools import reduce
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 
@@ -63,6 +64,11 @@ def succeeded(result: Result) -> Bool[Array, "*batch"]:
     """Return whether a computation ended as it should."""
     good = Result.steps_done, Result.converged, Result.fitted, Result.settled
     return reduce(operator.or_, (result == member for member in good))
+
+
+def raise_unless_ok(result: Result) -> None:
+    """Raise the sentence of a known result that is not ok."""
+    result.error_if(jnp.zeros(()), ~succeeded(result))
 
 
 # Equinox does not list the members.

@@ -58,7 +58,7 @@ def good_calls(folder: Path) -> dict:
         "solver": jd.QuasiNewton(),
         "max_evaluations": 5,
     }
-    fit = {**observed, "adjoint": jd.Implicit(), "progress": print}
+    fit = {**observed, "adjoint": jd.Implicit(), "progress": print, "throw": False}
     deformed = {
         "problem": soft,
         "rigidity": np.ones(N),
@@ -188,7 +188,7 @@ def good_calls(folder: Path) -> dict:
         "estimate_rigidity_thesis": (
             jd.estimate_rigidity_thesis,
             {k: v for k, v in observed.items() if k != "mask"}
-            | {"step_size": 0.01, "threshold": 1e-3},
+            | {"step_size": 0.01, "threshold": 1e-3, "throw": False},
         ),
         "find_handle_groups": (
             jd.find_handle_groups,
@@ -205,7 +205,10 @@ def good_calls(folder: Path) -> dict:
         "rc_arap": (jd.rc_arap, {**rigid, "r": 1}),
         "sr_arap": (
             jd.sr_arap,
-            {**rigid, "alpha": 0.02, "tolerance": 1e-3, "max_steps": 3, "steps": 3},
+            {
+                **rigid,
+                **{"alpha": 0.02, "tolerance": 1e-3, "max_steps": 3, "steps": 3, "throw": False},
+            },
         ),
         "laplacian_editing": (jd.laplacian_editing, {**edit, "targets": TARGETS}),
         "laplacian_editor": (jd.laplacian_editor, edit),

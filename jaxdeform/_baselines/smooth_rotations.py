@@ -32,14 +32,14 @@ from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.lbfgs import has_converged
+from jaxdeform._linalg.newton import STEP_TOLERANCE, Step, to_minimum
 from jaxdeform._linalg.rotations import rotation_matrices
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.polygons import triangle_area_vectors
 from jaxdeform._result import Result
 
-# Of the linear system of the derivative: the residual that ends it, and that of the Newton step.
-_TOLERANCE, _NEWTON_TOLERANCE = 1e-10, 1e-2
-_MAX_STEPS = 2000
+# Of the linear system of the derivative: the residual that ends it, and the most steps.
+_TOLERANCE, _MAX_STEPS = 1e-10, 2000
 
 
 class SmoothEnergy(NamedTuple):
@@ -163,8 +163,8 @@ def with_derivative_of_minimum(
 
     By the implicit function theorem on the gradient to positions and to small turns w, with
     ``T(w) = T exp([w]x)``. Its Hessian is symmetric, so one conjugate gradient method serves
-    forward and reverse mode. As in `Implicit`, derivatives are taken one Newton step further, and
-    are NaN where the linear system is not solved.
+    forward and reverse mode. As in `Implicit`, derivatives are taken at the minimum next to p and
+    T, and are NaN where it is not found or the linear system not solved.
     """
 
     @jax.custom_jvp
@@ -177,16 +177,12 @@ def with_derivative_of_minimum(
         energy, targets, *_ = primals
         known = minimum(*primals)  # so that this rule has derivatives too
         at, there = jax.lax.stop_gradient(((energy, targets), known))
-        hessian, precondition = _hessian(*at, *there)
-        error = _slope(*at, *there)(_at_rest(known[0]), at[1])
-        step, left = _conjugate_gradients(hessian, precondition, -error, _NEWTON_TOLERANCE)
-        step = jnp.where(left <= _NEWTON_TOLERANCE, step, 0.0)
-        p, t = known[0] + step[0], _turned(known[1], step[1])
+        (p, t), found = _to_minimum(*at, *there)
         zero = _at_rest(p)
 
         def newton(targets, p, t):
             slope = _slope(energy, targets, p, t)(zero, targets)
-            step = _solve(*_hessian(energy, targets, p, t), -slope)
+            step = _solve(*_hessian(energy, targets, p, t), -slope, found)
             moved = jnp.where(energy.system.free[None], p + step[0], targets)
             return moved, _turned(t, step[1])
 
@@ -194,12 +190,27 @@ def with_derivative_of_minimum(
         p, t = with_derivative_of(newton, (p, t), targets, p, t)
         slope = _slope(energy, targets, p, t)
         _, right = jax.jvp(lambda targets: slope(zero, targets), (targets,), (tangents[1],))
-        move = _solve(*_hessian(energy, targets, p, t), -right)
+        move = _solve(*_hessian(energy, targets, p, t), -right, found)
         moved = jnp.where(energy.system.free[None], move[0], tangents[1])
         _, turned = jax.jvp(lambda w: _turned(t, w), (zero[1],), (move[1],))
         return (p, t), (moved, turned)
 
     return minimum(energy, targets, p, t)
+
+
+def _to_minimum(energy: SmoothEnergy, targets, p, t):
+    """Return the minimum next to p and T, and whether it was found."""
+
+    def step(state):
+        p, t = state
+        hessian, precondition = _hessian(energy, targets, p, t)
+        slope = _slope(energy, targets, p, t)(_at_rest(p), targets)
+        move, left = _conjugate_gradients(hessian, precondition, -slope, STEP_TOLERANCE)
+        moved = p + move[0], _turned(t, move[1])
+        # The slope is half the gradient, and half the product is gained.
+        return Step(moved, left, -jnp.sum(slope * move), *energy.value(p, t, energy.pull(t)))
+
+    return to_minimum(step, (p, t))
 
 
 def _at_rest(p: Float[Array, "3 v"]) -> Float[Array, "2 3 v"]:
@@ -245,13 +256,14 @@ def _hessian(energy: SmoothEnergy, targets, p, t):
     return multiply, precondition
 
 
-def _solve(multiply, precondition, right):
+def _solve(multiply, precondition, right, found):
     """Return the solution with the derivatives of it; NaN if it was not found."""
     tolerance = max(_TOLERANCE, 20 * float(jnp.finfo(right.dtype).eps))
 
     def solve(multiply, right):
         solution, left = _conjugate_gradients(multiply, precondition, right, tolerance)
-        return jnp.where(left <= max(100.0 * tolerance, 1e-6), solution, jnp.nan)
+        solved = found & (left <= max(100.0 * tolerance, 1e-6))
+        return jnp.where(solved, solution, jnp.nan)
 
     return jax.lax.custom_linear_solve(multiply, right, solve, symmetric=True)
 

@@ -11,7 +11,7 @@ from jaxdeform._baselines.smooth_rotations import (
     unrolled,
     with_derivative_of_minimum,
 )
-from jaxdeform._checks import check_count, check_tolerance, check_type
+from jaxdeform._checks import check_count, check_flag, check_tolerance, check_type
 from jaxdeform._deformation.arguments import from_center, read_inputs, read_shape
 from jaxdeform._deformation.problem import precompute
 from jaxdeform._deformation.reduced_energy import Inputs
@@ -39,6 +39,7 @@ def sr_arap(
     tolerance: float = 1e-8,
     max_steps: int = 5000,
     steps: int | None = None,
+    throw: bool = False,
 ) -> Solution:
     """Deform as rigidly as possible with rotations that vary smoothly, once.
 
@@ -69,6 +70,7 @@ def sr_arap(
     - tolerance: stop once a step gains less than this fraction of the energy.
     - max_steps: stop after that many steps all the same.
     - steps: take this many steps instead, whatever they gain.
+    - throw: raise an error if the result is not ``ok``, also inside jit.
 
     **Returns** a `Solution`: ``transforms`` are the rotations, ``energy`` includes their term.
     Numerical trouble comes back in its ``result``.
@@ -88,6 +90,7 @@ def sr_arap(
     alpha = check_tolerance("alpha", alpha)
     tolerance = check_tolerance("tolerance", tolerance)
     max_steps = check_count("max_steps", max_steps)
+    check_flag("throw", throw)
     if steps is not None:
         steps = check_count("steps", steps)
     problem = precompute(mesh, handles, cells=spokes(mesh, weights=weights))
@@ -97,7 +100,8 @@ def sr_arap(
         start = read_shape(problem, "start", start)
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
     how = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
-    return cut_to_mesh(_solve_at_once(energy, inputs, start, **how), problem.n_vertices)
+    out = cut_to_mesh(_solve_at_once(energy, inputs, start, **how), problem.n_vertices)
+    return out.result.error_if(out, ~out.ok) if throw else out
 
 
 def _solve(

@@ -14,8 +14,9 @@ from jaxdeform._deformation.metric import apply_metric, metric_of
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import InputError
-from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
+from jaxdeform._linalg.conjugate_gradients import conjugate_gradients, dot
 from jaxdeform._linalg.known_value import with_derivative_of
+from jaxdeform._linalg.newton import STEP_TOLERANCE, Step, to_minimum
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,13 @@ class Implicit:
     The Hessian H = A - K^T dT/dC K is symmetric, so one conjugate gradient method serves forward
     and reverse mode. Its preconditioner is the metric of ``QuasiNewton()``.
 
-    It is taken one Newton step further than the state, at the minimum, because the error of a
-    derivative is that of the state many times over: at the state of ``QuasiNewton()`` itself up to
-    2.6 % on the bent bar, after the step below 1e-4 (docs/derivatives.md has the table).
+    It is taken at the minimum next to the state, because the error of a derivative is that of the
+    state many times over: up to 5 % of a stiff bar's at the state of ``QuasiNewton()`` itself and
+    one Newton step further. Newton's method goes on until it is below 1e-6, mostly for two steps
+    (docs/derivatives.md has the table).
 
-    Where the linear system is not solved, the derivative is NaN, not a wrong number: the state is
-    at a saddle or far from converged, or ``max_steps`` is too low.
+    Where the minimum is not found or the linear system not solved, the derivative is NaN, not a
+    wrong number: the state is at a saddle or far from converged, or ``max_steps`` is too low.
 
     **Fields**
 
@@ -119,8 +121,8 @@ class Implicit:
     def minimum(self, energy: ReducedEnergy, system, inputs, p, transforms):
         """Return p, known to be near the minimiser for these inputs, with the derivatives of that.
 
-        If any derivative is asked for, p is moved by a Newton step, and the derivatives are taken
-        there; they need that place as well.
+        If any derivative is asked for, p moves to the minimum, and the derivatives are taken there;
+        they need that place as well.
 
         (lax.custom_root would do it too, but it traces the derivatives even where nobody asks for
         any: 0.7 s.)
@@ -133,11 +135,11 @@ class Implicit:
 
         @minimiser.defjvp
         def minimiser_jvp(primals, tangents):
-            system, inputs, *state = primals
+            system, inputs, state, _ = primals
             known, _ = minimiser(*primals)  # so that this rule has derivatives too
             metric = metric_of(system, energy.local, inputs.rigidity)
             precondition = lambda x: apply_metric(system, metric, x) + system.held(x)  # noqa: E731
-            p, transforms = self._newton_step(energy, system, inputs, precondition, *state)
+            (p, transforms), found = self._to_minimum(energy, system, inputs, precondition, state)
             p = p + known - jax.lax.stop_gradient(known)
 
             def gradient(free, inputs):
@@ -146,40 +148,48 @@ class Implicit:
 
             def newton(p, inputs):
                 slope, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
-                step = self._solve_hessian(system, hessian, precondition, -slope)
+                step = self._solve_hessian(system, hessian, precondition, -slope, found)
                 return jnp.where(system.free[None], p + step, inputs.targets)
 
             # A Newton step of size 0, whose derivatives need no rule.
             p = with_derivative_of(newton, p, p, inputs)
             _, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
             _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
-            move = self._solve_hessian(system, hessian, precondition, -right)
+            move = self._solve_hessian(system, hessian, precondition, -right, found)
             move = jnp.where(system.free[None], move, tangents[1].targets)
             moves = move, Anchor(move, jnp.zeros_like(transforms))
             return (p, Anchor(p, transforms)), moves
 
         return minimiser(system, inputs, p, transforms)
 
-    def _newton_step(self, energy: ReducedEnergy, system, inputs, precondition, p, transforms):
-        """Return p after one Newton step, and the transformations there (to first order)."""
-        system, inputs, p, transforms = jax.lax.stop_gradient((system, inputs, p, transforms))
+    def _to_minimum(self, energy: ReducedEnergy, system, inputs, precondition, p):
+        """Return the minimum next to p, the transformations there, and whether it was found.
+
+        By Newton's method. The transformations follow its last step to first order.
+        """
+        known = inputs._replace(geometry=None)
+        system, inputs, p = jax.lax.stop_gradient((system, known, p))
 
         def evaluate(x):
-            at = energy.evaluate(system, inputs, x, transforms)
-            return at.gradient, at.transforms
+            at = energy.evaluate(system, inputs, x)
+            return (at.gradient, at.transforms), at
 
-        (gradient, _), linear = jax.linearize(evaluate, p)
-        step, left = conjugate_gradients(
-            lambda x: linear(x)[0] + system.held(x),
-            precondition,
-            -gradient,
-            _NEWTON_TOLERANCE,
-            self.max_steps,
-        )
-        step = jnp.where(left <= _NEWTON_TOLERANCE, step, 0.0)
-        return p + step, transforms + linear(step)[1]
+        def step(state):
+            p, _ = state
+            (gradient, transforms), linear, at = jax.linearize(evaluate, p, has_aux=True)
+            move, left = conjugate_gradients(
+                lambda x: linear(x)[0] + system.held(x),
+                precondition,
+                -gradient,
+                STEP_TOLERANCE,
+                self.max_steps,
+            )
+            moved = p + move, transforms + linear(move)[1]
+            return Step(moved, left, -dot(gradient, move), at.energy, at.rounding)
 
-    def _solve_hessian(self, system: System, hessian, precondition, right):
+        return to_minimum(step, (p, jnp.zeros((3, *p.shape), p.dtype)))
+
+    def _solve_hessian(self, system: System, hessian, precondition, right, found):
         tolerance = max(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
         accepted = max(100.0 * tolerance, 1e-6)
 
@@ -187,7 +197,7 @@ class Implicit:
             solution, left = conjugate_gradients(
                 multiply, precondition, b, tolerance, self.max_steps
             )
-            unsolved = ~(left <= accepted)
+            unsolved = ~(found & (left <= accepted))
             if self.throw:
                 return eqx.error_if(solution, unsolved, _UNSOLVED)
             return jnp.where(unsolved, jnp.nan, solution)
@@ -197,13 +207,8 @@ class Implicit:
         )
 
 
-# Of the step to the minimum: 1e-3 gains nothing, 1e-1 leaves four times the error (bar, rigidity
-# 0.05 and 5, state of tolerance 1e-6: gradient off by 1.2e-2 without the step, then 1.4e-4, 3.8e-5
-# and 2.0e-5 with 1e-1, 1e-2 and 1e-3).
-_NEWTON_TOLERANCE = 1e-2
-
 _UNSOLVED = (
-    "the derivative is unknown: conjugate gradients did not solve its linear system. The state is "
-    "at a saddle or far from converged (lower the tolerance of the solver), or Implicit needs more "
-    "max_steps"
+    "the derivative is unknown: the minimum was not found, or conjugate gradients did not solve "
+    "their linear system. The state is at a saddle or far from converged (lower the tolerance of "
+    "the solver), or Implicit needs more max_steps"
 )

@@ -15,7 +15,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdeform._checks import check_count, check_function, check_tolerance
+from jaxdeform._checks import check_count, check_flag, check_function, check_tolerance
 from jaxdeform._deformation.adjoint import Implicit
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem, rigidity_from_material
@@ -41,7 +41,7 @@ from jaxdeform._estimation.poses import (
 from jaxdeform._estimation.search import Found, search
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.waiting import settled
-from jaxdeform._result import Result, succeeded
+from jaxdeform._result import Result, raise_unless_ok, succeeded
 
 # The prior is strong at first and weakens by this factor a stage.
 _STRONGEST, _RELAX = 1e-2, 0.1
@@ -106,6 +106,7 @@ def estimate_rigidity_field(
     adjoint: Adjoint | None = None,
     max_evaluations: int = 50,
     progress: Callable[[int, float, np.ndarray], None] | None = None,
+    throw: bool = False,
 ) -> FieldEstimate:
     """Estimate a rigidity that varies smoothly over the mesh: one unknown per vertex.
 
@@ -118,7 +119,7 @@ def estimate_rigidity_field(
 
     **Arguments**
 
-    - problem, observed, targets, mask, solver, adjoint, max_evaluations, progress: as
+    - problem, observed, targets, mask, solver, adjoint, max_evaluations, progress, throw: as
       `estimate_rigidity`.
     - smoothness: weight of the prior. Left out, it is the one under which the poses are most
       probable (marginal likelihood): ``(noise / (diagonal * slope))^2``, with the standard
@@ -144,6 +145,7 @@ def estimate_rigidity_field(
         check_tolerance("smoothness", smoothness, positive=True)
     check_count("max_evaluations", max_evaluations)
     check_function("progress", progress, "evaluation, misfit, rigidity")
+    check_flag("throw", throw)
     if adjoint is None and isinstance(solver, QuasiNewton):
         adjoint = _ADJOINT
     adjoint = choose_adjoint(solver, adjoint)
@@ -154,6 +156,8 @@ def estimate_rigidity_field(
     theta = np.clip(np.log(check_start(start, medium, "vertex")), *bounds)
     found = _Search(problem, poses, bounds, solver, adjoint, max_evaluations, progress)
     best, weight, result, patterns = found.run(theta, smoothness)
+    if throw:
+        raise_unless_ok(result)
     noise = found.evidence(patterns, (weight, weight)).noise
     spread = deviations(patterns, found.prior.variances(), Evidence(weight, noise))
     theta = np.asarray(best.theta, np.float64)

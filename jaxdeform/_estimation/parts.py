@@ -12,7 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxdeform._checks import check_count, check_function, check_labels, check_tolerance
+from jaxdeform._checks import (
+    check_count,
+    check_flag,
+    check_function,
+    check_labels,
+    check_tolerance,
+)
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
@@ -29,7 +35,7 @@ from jaxdeform._estimation.smooth_modes import smooth_modes
 from jaxdeform._estimation.verdict import Verdict, in_words
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import read_mask_or_numbers
-from jaxdeform._result import Result, succeeded
+from jaxdeform._result import Result, raise_unless_ok, succeeded
 
 # Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
 # diagonal, which is ten times what solvers leave at their default tolerance.
@@ -136,6 +142,7 @@ def estimate_rigidity(
     determined_within: float = 10.0,
     max_evaluations: int = 50,
     progress: Callable[[int, float, np.ndarray], None] | None = None,
+    throw: bool = False,
 ) -> Estimate:
     """Estimate the rigidity of each part from observed poses, all poses together.
 
@@ -172,6 +179,7 @@ def estimate_rigidity(
       best value (for the verdict).
     - max_evaluations: limit of the search; intervals need more evaluations.
     - progress: called after each evaluation with its number, its misfit and the rigidities.
+    - throw: raise an error if the result is not ``ok``. By default its ``result`` says so.
 
     **Returns** an `Estimate`; its ``explain()`` says it in words.
 
@@ -193,6 +201,7 @@ def estimate_rigidity(
     check_tolerance("determined_within", determined_within, positive=True)
     check_count("max_evaluations", max_evaluations)
     check_function("progress", progress, "evaluation, misfit, rigidity")
+    check_flag("throw", throw)
     adjoint = choose_adjoint(solver, adjoint)
     noise = float(targets is None) if target_noise is None else target_noise
     check_tolerance("target_noise", noise)
@@ -201,7 +210,10 @@ def estimate_rigidity(
     label = check_parts(everywhere if parts is None else parts, problem.mesh)
     model = PartModel.build(problem, poses, label, solver, adjoint)
     found = _Search(model, noise, max_evaluations, progress).run(model.start(start))
-    return _judge(found, poses.counted, max(determined_within, 1.0))
+    out = _judge(found, poses.counted, max(determined_within, 1.0))
+    if throw:
+        raise_unless_ok(out.result)
+    return out
 
 
 class _Found(NamedTuple):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxdeform._checks import check_count, check_tolerance
+from jaxdeform._checks import check_count, check_flag, check_tolerance
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
@@ -14,7 +14,7 @@ from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.deformed import residual_of
 from jaxdeform._estimation.poses import check_poses
 from jaxdeform._linalg.waiting import settled
-from jaxdeform._result import Result
+from jaxdeform._result import Result, raise_unless_ok
 
 
 class ThesisEstimate(NamedTuple):
@@ -44,6 +44,7 @@ def estimate_rigidity_thesis(
     start: float = 1e-6,
     solver: Solver = Alternating(steps=100),  # noqa: B008 (frozen)
     max_evaluations: int = 1000,
+    throw: bool = False,
 ) -> ThesisEstimate:
     """Algorithm 1 of the thesis as written, for comparison: one rigidity, one pose.
 
@@ -74,18 +75,22 @@ def estimate_rigidity_thesis(
     check_tolerance("threshold", threshold)
     check_tolerance("start", start, positive=True)
     check_count("max_evaluations", max_evaluations)
+    check_flag("throw", throw)
     choose_adjoint(solver, None)
     rigidity, path, history = float(start), [], []
+    result = Result.evaluation_limit
     for _ in range(max_evaluations):
         vertices = settled(deform(problem, poses.targets[0], rigidity, solver=solver).vertices)
         path.append(rigidity)
         history.append(float(np.linalg.norm(residual_of(poses, vertices[None]))))
-        if not np.isfinite(history[-1]):
-            return ThesisEstimate(
-                rigidity, np.array(path), np.array(history), Result.fit_not_finite
-            )
         step = step_size * history[-1]
+        if not np.isfinite(step):
+            result = Result.fit_not_finite
+            break
         rigidity += step
         if step / rigidity < threshold:
-            return ThesisEstimate(rigidity, np.array(path), np.array(history), Result.settled)
-    return ThesisEstimate(rigidity, np.array(path), np.array(history), Result.evaluation_limit)
+            result = Result.settled
+            break
+    if throw:
+        raise_unless_ok(result)
+    return ThesisEstimate(rigidity, np.array(path), np.array(history), result)

@@ -56,7 +56,7 @@ def test_sparse_factor_under_jit_vmap_grad():
         np.testing.assert_allclose(batch[1][k], (loss(r + h) - loss(r - h)) / (2 * h), rtol=FD)
 
 
-def _held_loss(local, solver):
+def _held_loss(local, solver, adjoint=None):
     """Of the height of a target and the logarithm of the rigidity."""
     mesh, handles, targets = held_sheet()
     problem = jd.precompute(mesh, handles)
@@ -64,7 +64,8 @@ def _held_loss(local, solver):
 
     def loss(x):
         moved = jnp.asarray(targets) + x[0] * upper
-        out = jd.deform(problem, moved, jnp.exp(x[1]), local=local, solver=solver)
+        rigidity = jnp.exp(x[1])
+        out = jd.deform(problem, moved, rigidity, local=local, solver=solver, adjoint=adjoint)
         return jnp.sum(out.vertices**2) + out.energy[-1]
 
     return loss
@@ -94,10 +95,11 @@ def test_second_derivatives_are_the_differences_of_the_first(law, solver):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver", [jd.QuasiNewton(), jd.Alternating(5)], ids=["implicit", "unrolled"]
+    ("steps", "adjoint"), [(300, jd.Implicit()), (5, jd.Unrolled())], ids=["implicit", "unrolled"]
 )
-def test_all_orders_of_forward_and_reverse_agree(solver):
-    loss = _held_loss(jd.Newton(), solver)
+def test_all_orders_of_forward_and_reverse_agree(steps, adjoint):
+    """Of a solver that compiles in half the time of QuasiNewton: the rule is the same."""
+    loss = _held_loss(jd.Newton(), jd.Alternating(steps), adjoint)
     orders = [
         jax.jit(outer(inner(loss)))(AT)
         for outer in (jax.jacfwd, jax.jacrev)
@@ -133,8 +135,8 @@ def test_second_derivatives_through_a_scan_are_the_differences_of_the_first():
 
 
 @pytest.mark.slow
-def test_a_gradient_is_right_at_the_default_tolerance(bar, bar_problem, bar_targets, halves):
-    """Of soft and stiff halves, where the state of tolerance 1e-8 alone is up to 2.6 % off."""
+def test_a_gradient_is_right_at_every_tolerance(bar, bar_problem, bar_targets, halves):
+    """Or NaN. One Newton step from the default state alone is up to 5 % off, of stiff halves."""
     weight = jnp.asarray(np.random.default_rng(0).normal(size=bar.vertices.shape))
     half = jnp.asarray(halves > 0)
 
@@ -147,10 +149,19 @@ def test_a_gradient_is_right_at_the_default_tolerance(bar, bar_problem, bar_targ
 
         return jax.jit(jax.grad(loss))
 
-    x = jnp.log(jnp.asarray([0.05, 5.0]))
-    exact = slope(jd.QuasiNewton(tolerance=1e-17, max_steps=3000))(x)
-    np.testing.assert_allclose(slope(jd.QuasiNewton())(x), exact, rtol=1e-4)
-    np.testing.assert_allclose(slope(jd.QuasiNewton(tolerance=1e-6))(x), exact, rtol=1e-3)
+    slopes = [
+        slope(jd.QuasiNewton(tolerance=tolerance, max_steps=3000))
+        for tolerance in (1e-15, jd.QuasiNewton().tolerance, 1e-2)
+    ]
+    size = float(np.mean(jd.rigidity_from_material(bar_problem, 1.0)))
+    found = 0
+    for materials in ([0.01, 1.0], [0.1, 0.1], [3.0, 30.0]):
+        exact, usual, loose = (f(jnp.log(size * jnp.asarray(materials))) for f in slopes)
+        np.testing.assert_allclose(usual, exact, rtol=1e-5, atol=1e-5 * np.abs(exact).max())
+        if np.isfinite(loose).all():
+            found += 1
+            np.testing.assert_allclose(loose, exact, rtol=1e-4, atol=1e-4 * np.abs(exact).max())
+    assert found >= 2
 
 
 @pytest.mark.slow
@@ -163,5 +174,5 @@ def test_an_unsolved_linear_system_gives_nan_or_raises(bar_problem, bar_targets)
         return jax.grad(loss)(0.3)
 
     assert np.isnan(slope(jd.Implicit(max_steps=1)))
-    with pytest.raises(Exception, match="conjugate gradients did not solve"):
+    with pytest.raises(Exception, match="conjugate gradients did not solve their"):
         slope(jd.Implicit(max_steps=1, throw=True))

@@ -19,7 +19,7 @@ def draw():
 @pytest.mark.parametrize(
     ("case", "seeds"),
     [
-        (Case(1, True, 1e-3), 100),
+        (Case(1, True, 1e-3), 60),
         (Case(1, False, 1e-3), 30),
         (Case(2, True, 1e-3), 20),
     ],
@@ -35,6 +35,6 @@ def test_intervals_cover_the_truth(draw, case, seeds):
     covered = np.sum([each.covered for each in draws], axis=0)
     assert covered.shape == (case.parts,)
     assert covered.min() >= stats.binom.ppf(CHANCE, seeds, 0.95)
-    if seeds >= 100:
+    if seeds >= 60:
         central = np.sum([each.central for each in draws])
         assert central <= stats.binom.isf(CHANCE, seeds, 0.79) < seeds

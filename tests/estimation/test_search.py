@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -253,3 +254,22 @@ def test_optimistix_ends_at_the_same_minimum(bar, bar_problem, bar_targets, pose
     peer = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
     found = optx.least_squares(residual, peer, jnp.asarray(0.0)).value
     np.testing.assert_allclose(fit.rigidity[0], jnp.exp(found), rtol=1e-6)
+
+
+# ---------------------------------------------------------------- throw
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [jd.estimate_rigidity, jd.estimate_rigidity_field, jd.estimate_rigidity_thesis],
+    ids=["parts", "field", "thesis"],
+)
+def test_throw_raises_what_the_result_says(estimate):
+    mesh = jd.shapes.square()
+    problem = jd.precompute(mesh, [0, 1, 2, 6, 7, 8])
+    targets = jd.twist(mesh.vertices[problem.handles], 60.0, along="y")
+    pose = jd.deform(problem, targets, 0.5).vertices
+    given = {"targets": targets, "max_evaluations": 1}
+    assert estimate(problem, pose, **given).result == jd.Result.evaluation_limit
+    with pytest.raises(eqx.EquinoxRuntimeError, match="Stopped at the limit of evaluations"):
+        estimate(problem, pose, throw=True, **given)
