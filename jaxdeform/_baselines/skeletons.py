@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_only
 from jaxdeform._checks import read_path
 from jaxdeform._errors import InputError, shown
 from jaxdeform._mesh.reading import read_text
@@ -77,7 +78,7 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
                 bones.append([i, j])
     if not bones:
         raise InputError(f"{path}: has {len(joints)} joints and no bones: is the line '#' missing?")
-    return Skeleton(np.array(joints), np.array(bones))
+    return Skeleton(read_only(np.array(joints)), read_only(np.array(bones)))
 
 
 def _joint(where: str, words: list[str], expected: int) -> list[float]:

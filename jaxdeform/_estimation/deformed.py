@@ -95,7 +95,7 @@ def pose(system: System, known: Known, field, solver, adjoint) -> Float[Array, "
 def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDerivatives:
     """Deform into all poses, with derivatives in forward mode, all parts at once.
 
-    With implicit derivatives comes a Newton step, so the positions are those of the minimum itself.
+    Implicit derivatives are taken at the minimum next to each end, and so are the positions.
     """
     theta = np.asarray(theta, problem.dtype)
     ends = states(problem, poses, np.exp(theta)[label], solver, adjoint)

@@ -84,7 +84,8 @@ def save_mesh(
 
     OBJ, OFF, text STL and PLY keep every bit: a PLY's ``float`` positions become ``double`` if they
     need more digits than ``float`` holds. Binary STL keeps single precision, with a warning if an
-    edge feels it. Any STL makes one vertex of those in one place, with a warning if there are such.
+    edge feels it. Any STL makes one vertex of those in one place, and leaves out those without a
+    face, with a warning if there are such.
 
     The file is written under a temporary name, brought to the disk and then renamed, so an old file
     is either kept or replaced as a whole. It keeps its permissions, and a symbolic link stays one.

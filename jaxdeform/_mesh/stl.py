@@ -176,6 +176,11 @@ def check_stl(path: Path, points: np.ndarray, faces: np.ndarray, *, binary: bool
             f"{path}: STL makes one vertex of those in one place, so that {joined} fewer come back "
             f"and surfaces that were apart may hang together: {move}"
         )
+    if len(used) < len(points):
+        lost.append(
+            f"{path}: STL holds faces alone, so that {len(points) - len(used)} vertices without a "
+            f"face do not come back, and those after them have other numbers: {move}"
+        )
     return lost
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_only
 from jaxdeform._checks import check_type, read_host_positions
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells, rings
@@ -112,4 +113,5 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     )
     membership.eliminate_zeros()
     piece_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
-    return Submesh(piece, piece_cells, np.flatnonzero(~is_free[index]), index, mesh)
+    held = np.flatnonzero(~is_free[index])
+    return Submesh(piece, piece_cells, read_only(held), read_only(index), mesh)

@@ -260,7 +260,7 @@ def test_vertices_that_an_stl_joins_are_told(tmp_path, text):
     """Two tetrahedra that touch with a corner in the pose."""
     path = tmp_path / "m.stl"
     v, f = tetrahedron()
-    both = np.concatenate([v, tetrahedron([2, 0, 0])[0], [[9, 9, 9]]])
+    both = np.concatenate([v, tetrahedron([2, 0, 0])[0]])
     mesh = jd.Mesh(both, np.concatenate([f, f + 4]))
     if text:
         lines = ["solid"]
@@ -275,6 +275,14 @@ def test_vertices_that_an_stl_joins_are_told(tmp_path, text):
         jd.save_mesh(path, mesh, vertices=mesh.vertices + shift)
     back = jd.load_mesh(path)
     assert (back.n_vertices, back.n_faces) == (7, 8)
+
+
+def test_vertices_that_an_stl_leaves_out_are_told(tmp_path):
+    v, f = tetrahedron()
+    mesh = jd.Mesh(np.concatenate([[[9, 9, 9]], v]), f + 1)
+    with pytest.warns(UserWarning, match="1 vertices without a face do not come back"):
+        jd.save_mesh(tmp_path / "m.stl", mesh)
+    assert jd.load_mesh(tmp_path / "m.stl").n_vertices == 4
 
 
 @pytest.mark.parametrize("suffix", [".off", ".obj", ".ply", ".stl", ".ply.gz"])
