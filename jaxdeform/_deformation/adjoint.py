@@ -68,7 +68,7 @@ class Implicit:
 
     It is taken at the minimum next to the state, because the error of a derivative is that of the
     state many times over: up to 5 % of a stiff bar's at the state of ``QuasiNewton()`` itself and
-    one Newton step further. Newton's method goes on until it is below 1e-6, mostly for two steps
+    one Newton step further. Newton's method goes on until it is below 1e-5, mostly for two steps
     (docs/derivatives.md has the table).
 
     Where the minimum is not found or the linear system not solved, the derivative is NaN, not a
