@@ -2,10 +2,13 @@
 
 import operator
 from functools import reduce
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
+
+from jaxdeform._arrays import is_concrete
 
 
 class Result(eqx.Enumeration):
@@ -66,9 +69,15 @@ def succeeded(result: Result) -> Bool[Array, "*batch"]:
     return reduce(operator.or_, (result == member for member in good))
 
 
-def raise_unless_ok(result: Result) -> None:
-    """Raise the sentence of a known result that is not ok."""
-    result.error_if(jnp.zeros(()), ~succeeded(result))
+def check_result(out: Any, throw: bool) -> Any:
+    """Return an output; with ``throw``, raise the sentence of its result where that is not ok."""
+    if not throw:
+        return out
+    failed = ~succeeded(out.result)
+    if is_concrete(failed):
+        out.result.error_if(jnp.zeros(()), failed)
+        return out
+    return out.result.error_if(out, failed)  # raised as the program runs
 
 
 # Equinox does not list the members.

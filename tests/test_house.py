@@ -24,8 +24,8 @@ PACKAGE = ROOT / "jaxdeform"
 
 # From the ground up. A module imports from lower floors, or from its own without a circle.
 FLOORS = [
-    ["_errors", "_result"],
-    ["_arrays", "_checks"],
+    ["_errors"],
+    ["_arrays", "_checks", "_result"],
     ["_mesh"],
     ["_linalg"],
     ["_handles"],

@@ -32,7 +32,7 @@ from jaxdeform._linalg.conjugate_gradients import conjugate_gradients
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.lbfgs import has_converged
-from jaxdeform._linalg.newton import STEP_TOLERANCE, Step, to_minimum
+from jaxdeform._linalg.newton import STEP_TOLERANCE, HessianSolver, Step, to_minimum
 from jaxdeform._linalg.rotations import rotation_matrices
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.polygons import triangle_area_vectors
@@ -179,10 +179,11 @@ def with_derivative_of_minimum(
         at, there = jax.lax.stop_gradient(((energy, targets), known))
         (p, t), found = _to_minimum(*at, *there)
         zero = _at_rest(p)
+        solver = HessianSolver(_preconditioner(energy, p, t), found, _TOLERANCE, _MAX_STEPS)
 
         def newton(targets, p, t):
             slope = _slope(energy, targets, p, t)(zero, targets)
-            step = _solve(*_hessian(energy, targets, p, t), -slope, found)
+            step = solver.solve(_hessian(energy, targets, p, t), -slope)
             moved = jnp.where(energy.system.free[None], p + step[0], targets)
             return moved, _turned(t, step[1])
 
@@ -190,7 +191,7 @@ def with_derivative_of_minimum(
         p, t = with_derivative_of(newton, (p, t), targets, p, t)
         slope = _slope(energy, targets, p, t)
         _, right = jax.jvp(lambda targets: slope(zero, targets), (targets,), (tangents[1],))
-        move = _solve(*_hessian(energy, targets, p, t), -right, found)
+        move = solver.solve(_hessian(energy, targets, p, t), -right)
         moved = jnp.where(energy.system.free[None], move[0], tangents[1])
         _, turned = jax.jvp(lambda w: _turned(t, w), (zero[1],), (move[1],))
         return (p, t), (moved, turned)
@@ -203,9 +204,9 @@ def _to_minimum(energy: SmoothEnergy, targets, p, t):
 
     def step(state):
         p, t = state
-        hessian, precondition = _hessian(energy, targets, p, t)
+        hessian, precondition = _hessian(energy, targets, p, t), _preconditioner(energy, p, t)
         slope = _slope(energy, targets, p, t)(_at_rest(p), targets)
-        move, left = _conjugate_gradients(hessian, precondition, -slope, STEP_TOLERANCE)
+        move, left = conjugate_gradients(hessian, precondition, -slope, STEP_TOLERANCE, _MAX_STEPS)
         moved = p + move[0], _turned(t, move[1])
         # The slope is half the gradient, and half the product is gained.
         return Step(moved, left, -jnp.sum(slope * move), *energy.value(p, t, energy.pull(t)))
@@ -239,40 +240,29 @@ def _slope(energy: SmoothEnergy, targets, p, t):
 
 
 def _hessian(energy: SmoothEnergy, targets, p, t):
-    """Return the Hessian as a function, and a preconditioner: A for u, the size of C for w."""
+    """Return the Hessian as a function; the identity for vertices and rotations that are fixed."""
     system, slope = energy.system, _slope(energy, targets, p, t)
     _, hessian = jax.linearize(lambda x: slope(x, targets), _at_rest(p))
-    c = jnp.swapaxes(system.covariance(p), 0, 1)
-    size = jax.lax.stop_gradient(jnp.sum(t * (c + energy.pull(t)), axis=(0, 1)))
-    point = ~(size > 0)  # an unreferenced vertex has no rotation
+    point = ~(_turning_stiffness(energy, p, t) > 0)
 
     def multiply(x):
         return hessian(x) + jnp.stack([system.held(x[0]), jnp.where(point[None], x[1], 0.0)])
 
+    return multiply
+
+
+def _preconditioner(energy: SmoothEnergy, p, t):
+    """Return A^-1 for u, and one over the size of C for w."""
+    system, size = energy.system, _turning_stiffness(energy, p, t)
+
     def precondition(x):
-        turn = x[1] / jnp.where(point, 1.0, size)[None]
+        turn = x[1] / jnp.where(size > 0, size, 1.0)[None]
         return jnp.stack([system.factor.solve(x[0]) + system.held(x[0]), turn])
 
-    return multiply, precondition
+    return precondition
 
 
-def _solve(multiply, precondition, right, found):
-    """Return the solution with the derivatives of it; NaN if it was not found."""
-    tolerance = max(_TOLERANCE, 20 * float(jnp.finfo(right.dtype).eps))
-
-    def solve(multiply, right):
-        solution, left = _conjugate_gradients(multiply, precondition, right, tolerance)
-        solved = found & (left <= max(100.0 * tolerance, 1e-6))
-        return jnp.where(solved, solution, jnp.nan)
-
-    return jax.lax.custom_linear_solve(multiply, right, solve, symmetric=True)
-
-
-def _conjugate_gradients(multiply, precondition, right, tolerance: float):
-    def flat(function):
-        return lambda x: function(x.reshape(right.shape)).reshape(3, -1)
-
-    x, left = conjugate_gradients(
-        flat(multiply), flat(precondition), right.reshape(3, -1), tolerance, _MAX_STEPS
-    )
-    return x.reshape(right.shape), left
+def _turning_stiffness(energy: SmoothEnergy, p, t) -> Float[Array, "v"]:
+    """Return tr(T (C + pull)), as a constant: 0 where an unreferenced vertex has no rotation."""
+    c = jnp.swapaxes(energy.system.covariance(p), 0, 1)
+    return jax.lax.stop_gradient(jnp.sum(t * (c + energy.pull(t)), axis=(0, 1)))

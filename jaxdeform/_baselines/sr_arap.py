@@ -26,6 +26,7 @@ from jaxdeform._errors import ArrayLike
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._mesh.cells import spokes
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._result import check_result
 
 
 def sr_arap(
@@ -101,7 +102,7 @@ def sr_arap(
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
     how = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
     out = cut_to_mesh(_solve_at_once(energy, inputs, start, **how), problem.n_vertices)
-    return out.result.error_if(out, ~out.ok) if throw else out
+    return check_result(out, throw)
 
 
 def _solve(

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,7 +15,7 @@ from jaxdeform._deformation.system import System
 from jaxdeform._errors import InputError
 from jaxdeform._linalg.conjugate_gradients import conjugate_gradients, dot
 from jaxdeform._linalg.known_value import with_derivative_of
-from jaxdeform._linalg.newton import STEP_TOLERANCE, Step, to_minimum
+from jaxdeform._linalg.newton import STEP_TOLERANCE, HessianSolver, Step, to_minimum
 
 
 @dataclass(frozen=True)
@@ -140,6 +139,7 @@ class Implicit:
             metric = metric_of(system, energy.local, inputs.rigidity)
             precondition = lambda x: apply_metric(system, metric, x) + system.held(x)  # noqa: E731
             (p, transforms), found = self._to_minimum(energy, system, inputs, precondition, state)
+            hessian = HessianSolver(precondition, found, self.tolerance, self.max_steps, self.throw)
             p = p + known - jax.lax.stop_gradient(known)
 
             def gradient(free, inputs):
@@ -147,15 +147,15 @@ class Implicit:
                 return energy.evaluate(system, inputs, moved, transforms).gradient
 
             def newton(p, inputs):
-                slope, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
-                step = self._solve_hessian(system, hessian, precondition, -slope, found)
+                slope, linear = jax.linearize(lambda x: gradient(x, inputs), p)
+                step = hessian.solve(lambda x: linear(x) + system.held(x), -slope)
                 return jnp.where(system.free[None], p + step, inputs.targets)
 
             # A Newton step of size 0, whose derivatives need no rule.
             p = with_derivative_of(newton, p, p, inputs)
-            _, hessian = jax.linearize(lambda x: gradient(x, inputs), p)
+            _, linear = jax.linearize(lambda x: gradient(x, inputs), p)
             _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
-            move = self._solve_hessian(system, hessian, precondition, -right, found)
+            move = hessian.solve(lambda x: linear(x) + system.held(x), -right)
             move = jnp.where(system.free[None], move, tangents[1].targets)
             moves = move, Anchor(move, jnp.zeros_like(transforms))
             return (p, Anchor(p, transforms)), moves
@@ -188,27 +188,3 @@ class Implicit:
             return Step(moved, left, -dot(gradient, move), at.energy, at.rounding)
 
         return to_minimum(step, (p, jnp.zeros((3, *p.shape), p.dtype)))
-
-    def _solve_hessian(self, system: System, hessian, precondition, right, found):
-        tolerance = max(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
-        accepted = max(100.0 * tolerance, 1e-6)
-
-        def solve(multiply, b):
-            solution, left = conjugate_gradients(
-                multiply, precondition, b, tolerance, self.max_steps
-            )
-            unsolved = ~(found & (left <= accepted))
-            if self.throw:
-                return eqx.error_if(solution, unsolved, _UNSOLVED)
-            return jnp.where(unsolved, jnp.nan, solution)
-
-        return jax.lax.custom_linear_solve(
-            lambda x: hessian(x) + system.held(x), right, solve, symmetric=True
-        )
-
-
-_UNSOLVED = (
-    "the derivative is unknown: the minimum was not found, or conjugate gradients did not solve "
-    "their linear system. The state is at a saddle or far from converged (lower the tolerance of "
-    "the solver), or Implicit needs more max_steps"
-)

@@ -23,6 +23,7 @@ from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.lbfgs import SLOTS
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
+from jaxdeform._result import check_result
 
 # Arrays of a member, in numbers per vertex: targets, start, rigidity, positions, transforms, and
 # what the compiler keeps of them meanwhile.
@@ -99,7 +100,7 @@ def deform_batch(
         if progress is not None:
             progress(members.stop, total)
     out = jax.tree.map(lambda *x: jnp.concatenate(x), *done) if len(done) > 1 else done[0]
-    return out.result.error_if(out, ~out.ok) if throw else out
+    return check_result(out, throw)
 
 
 def deform_in_chunks(

@@ -25,7 +25,7 @@ from jaxdeform._deformation.solve import Solution, cut_to_mesh, descend, guess, 
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
-from jaxdeform._result import Result
+from jaxdeform._result import Result, check_result
 
 
 def deform_path(
@@ -105,7 +105,7 @@ def deform_path(
             )
         out = _follow_slowly(system, inputs, last, how, progress)
     out = cut_to_mesh(out, problem.n_vertices)
-    return out.result.error_if(out, ~out.ok) if throw else out
+    return check_result(out, throw)
 
 
 def _from_center(problem: Problem, targets: ArrayLike) -> Float[Array, "frames 3 handles"] | Any:

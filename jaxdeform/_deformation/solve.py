@@ -32,7 +32,7 @@ from jaxdeform._linalg.buckets import cut, fill_up
 from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
-from jaxdeform._result import Result, succeeded
+from jaxdeform._result import Result, check_result, succeeded
 
 
 class Solution(eqx.Module):
@@ -166,7 +166,7 @@ def deform(
                 "adjoint=jd.Implicit()"
             )
     out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, how), problem.n_vertices)
-    return out.result.error_if(out, ~out.ok) if throw else out
+    return check_result(out, throw)
 
 
 def cut_to_mesh(out: Solution, count: int) -> Solution:

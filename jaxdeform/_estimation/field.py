@@ -41,7 +41,7 @@ from jaxdeform._estimation.poses import (
 from jaxdeform._estimation.search import Found, search
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.waiting import settled
-from jaxdeform._result import Result, raise_unless_ok, succeeded
+from jaxdeform._result import Result, check_result, succeeded
 
 # The prior is strong at first and weakens by this factor a stage.
 _STRONGEST, _RELAX = 1e-2, 0.1
@@ -156,13 +156,11 @@ def estimate_rigidity_field(
     theta = np.clip(np.log(check_start(start, medium, "vertex")), *bounds)
     found = _Search(problem, poses, bounds, solver, adjoint, max_evaluations, progress)
     best, weight, result, patterns = found.run(theta, smoothness)
-    if throw:
-        raise_unless_ok(result)
     noise = found.evidence(patterns, (weight, weight)).noise
     spread = deviations(patterns, found.prior.variances(), Evidence(weight, noise))
     theta = np.asarray(best.theta, np.float64)
     ends = _NORMAL_95 * spread[:, None] * np.array([-1.0, 1.0])
-    return FieldEstimate(
+    out = FieldEstimate(
         field=np.exp(theta),
         interval=np.exp(theta[:, None] + ends),
         determined=ends[:, 1] <= np.log(10.0),
@@ -173,6 +171,7 @@ def estimate_rigidity_field(
         history=np.array(found.history),
         result=result,
     )
+    return check_result(out, throw)
 
 
 def _sizes(problem: Problem) -> Float[np.ndarray, "vertices"]:

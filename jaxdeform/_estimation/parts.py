@@ -35,7 +35,7 @@ from jaxdeform._estimation.smooth_modes import smooth_modes
 from jaxdeform._estimation.verdict import Verdict, in_words
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import read_mask_or_numbers
-from jaxdeform._result import Result, raise_unless_ok, succeeded
+from jaxdeform._result import Result, check_result, succeeded
 
 # Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
 # diagonal, which is ten times what solvers leave at their default tolerance.
@@ -210,10 +210,7 @@ def estimate_rigidity(
     label = check_parts(everywhere if parts is None else parts, problem.mesh)
     model = PartModel.build(problem, poses, label, solver, adjoint)
     found = _Search(model, noise, max_evaluations, progress).run(model.start(start))
-    out = _judge(found, poses.counted, max(determined_within, 1.0))
-    if throw:
-        raise_unless_ok(out.result)
-    return out
+    return check_result(_judge(found, poses.counted, max(determined_within, 1.0)), throw)
 
 
 class _Found(NamedTuple):

@@ -14,7 +14,7 @@ from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.deformed import residual_of
 from jaxdeform._estimation.poses import check_poses
 from jaxdeform._linalg.waiting import settled
-from jaxdeform._result import Result, raise_unless_ok
+from jaxdeform._result import Result, check_result
 
 
 class ThesisEstimate(NamedTuple):
@@ -91,6 +91,5 @@ def estimate_rigidity_thesis(
         if step / rigidity < threshold:
             result = Result.settled
             break
-    if throw:
-        raise_unless_ok(result)
-    return ThesisEstimate(rigidity, np.array(path), np.array(history), result)
+    out = ThesisEstimate(rigidity, np.array(path), np.array(history), result)
+    return check_result(out, throw)

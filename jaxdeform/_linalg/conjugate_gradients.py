@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Vectors = Float[Array, "3 v"]
+# One vector, of any shape.
+Vectors = Float[Array, "..."]
 
 
 def conjugate_gradients(

@@ -8,9 +8,12 @@ by 1.4e-4, 3.8e-5 and 2.0e-5 with 1e-1, 1e-2 and 1e-3).
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from jaxdeform._linalg.conjugate_gradients import Vectors, conjugate_gradients
 
 STEP_TOLERANCE = 1e-2
 # The last step gains less than this fraction of the energy. The gradient of the bar (bends, twist,
@@ -56,3 +59,39 @@ def to_minimum(take: Callable[[Any], Step], state: Any) -> tuple[Any, Bool[Array
     begin = jnp.zeros((), jnp.int32), jnp.asarray(False), state
     _, found, state = jax.lax.while_loop(far, body, begin)
     return state, found
+
+
+class HessianSolver(NamedTuple):
+    """Linear systems with the Hessian at a minimum, by conjugate gradients."""
+
+    precondition: Callable[[Vectors], Vectors]
+    found: Bool[Array, ""]
+    """Whether the minimum was found; if not, no derivative there is right."""
+    tolerance: float
+    """Relative residual, but no less than the precision allows."""
+    max_steps: int
+    throw: bool = False
+    """Raise an error, also inside jit, instead of returning NaN."""
+
+    def solve(self, hessian: Callable[[Vectors], Vectors], right: Vectors) -> Vectors:
+        """Return the solution, which has derivatives; NaN where it was not found."""
+        tolerance = max(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
+        accepted = max(100.0 * tolerance, 1e-6)
+
+        def solve(multiply, right):
+            solution, left = conjugate_gradients(
+                multiply, self.precondition, right, tolerance, self.max_steps
+            )
+            unsolved = ~(self.found & (left <= accepted))
+            if self.throw:
+                return eqx.error_if(solution, unsolved, _UNSOLVED)
+            return jnp.where(unsolved, jnp.nan, solution)
+
+        return jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True)
+
+
+_UNSOLVED = (
+    "the derivative is unknown: the minimum was not found, or conjugate gradients did not solve "
+    "their linear system. The state is at a saddle or far from converged (lower the tolerance of "
+    "the solver), or Implicit needs more max_steps"
+)

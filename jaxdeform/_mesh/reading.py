@@ -27,11 +27,12 @@ def read_bytes(path: Path) -> bytes:
     **Raises** InputError: the file is missing, empty, unreadable, or not a regular file.
     """
     try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device"
             raise InputError(f"{path}: cannot be read (it is {kind}): give the name of a file")
-        data = path.read_bytes()
+        # Linux's /proc/kmsg has no size either, and to read it can wait for ever.
+        data = path.read_bytes() if status.st_size else b""
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}): check the name") from error
     except ValueError as error:

@@ -1,5 +1,6 @@
 """Smooth-rotation ARAP against loops in NumPy, the engine, libigl and CGAL."""
 
+import equinox as eqx
 import igl
 import jax
 import jax.numpy as jnp
@@ -229,6 +230,10 @@ def test_what_happened_is_said():
     short = small_sr_arap(TARGETS, max_steps=2)
     assert bool(short.result == jd.Result.step_limit)
     assert int(short.steps) == 2
+    with pytest.raises(eqx.EquinoxRuntimeError, match="Stopped at the step limit"):
+        small_sr_arap(TARGETS, max_steps=2, throw=True)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="Stopped at the step limit"):
+        jax.jit(lambda x: small_sr_arap(x, max_steps=2, throw=True).vertices)(TARGETS)
     bad = jax.jit(lambda targets: small_sr_arap(targets))(TARGETS * np.nan)
     assert bool(bad.result == jd.Result.bad_input)
 

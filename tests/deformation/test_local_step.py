@@ -113,6 +113,27 @@ def test_derivatives_by_differences(local):
     np.testing.assert_allclose(both, jnp.sum(weight * tangent), rtol=1e-9)
 
 
+@pytest.mark.parametrize("local", [jd.Newton(), jd.RotationFit(), jd.AffineFit()], ids=name)
+def test_second_derivatives_are_the_differences_of_the_first(local):
+    """In all orders of forward and reverse, at a known minimum. LBFGS has the rules of Newton."""
+    c, b, lam = cells(0.2, n=30)
+    rng = np.random.default_rng(5)
+    dc, weight = (jnp.asarray(rng.normal(size=c.shape)) for _ in range(2))
+
+    def loss(x, known=None):
+        data = c + x[0] * dc, b, lam * jnp.exp(x[1])
+        t = fit(local, *data) if known is None else local.with_implicit_derivative(known, *data)
+        return jnp.sum(weight * t**2)
+
+    slope, h, at = jax.jit(jax.grad(loss)), 1e-5, jnp.zeros(2)
+    numeric = np.stack([(slope(at + h * d) - slope(at - h * d)) / (2 * h) for d in jnp.eye(2)])
+    known = fit(local, c, b, lam)
+    for outer in (jax.jacfwd, jax.jacrev):
+        for inner in (jax.jacfwd, jax.jacrev):
+            found = jax.jit(outer(inner(loss)))(at, known)
+            np.testing.assert_allclose(found, numeric, atol=FD * np.abs(numeric).max())
+
+
 @pytest.mark.parametrize("local", ALL, ids=name)
 def test_not_a_number_stays_in_its_cell(local):
     c, b, lam = cells(0.1)

@@ -3,6 +3,7 @@
 import gzip
 import os
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -174,6 +175,14 @@ def test_pipes_and_devices_are_refused(tmp_path, door):
     for name in ("pipe.ply", "zero.ply"):
         with pytest.raises(jd.InputError, match="it is a pipe or a device"):
             door(tmp_path / name)
+
+
+@pytest.mark.skipif(not Path("/proc/version").exists(), reason="Linux has it")
+def test_files_that_the_system_makes_as_they_are_read_are_not_read(tmp_path):
+    """As /proc/kmsg, where reading can wait for ever."""
+    (tmp_path / "system.ply").symlink_to("/proc/version")
+    with pytest.raises(jd.InputError, match="is empty"):
+        jd.load_mesh(tmp_path / "system.ply")
 
 
 @pytest.mark.parametrize("door", [jd.load_mesh, jd.inspect, check_output])
