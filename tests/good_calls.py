@@ -184,7 +184,10 @@ def good_calls(folder: Path) -> dict:
             jd.estimate_rigidity,
             {**fit, "parts": np.zeros(N, int), "target_noise": 0.0, "determined_within": 10.0},
         ),
-        "estimate_rigidity_field": (jd.estimate_rigidity_field, {**fit, "smoothness": 1e-4}),
+        "estimate_rigidity_field": (
+            jd.estimate_rigidity_field,
+            {**fit, "smoothness": 1e-4, "prior": "smooth"},
+        ),
         "estimate_rigidity_thesis": (
             jd.estimate_rigidity_thesis,
             {k: v for k, v in observed.items() if k != "mask"}

@@ -83,6 +83,7 @@ def strategy_of(kind: str, good) -> st.SearchStrategy | None:
         "flag": st.booleans,
         "axis": lambda: st.one_of(st.sampled_from("xyz"), numbers_like(np.ones(3))),
         "mesh": lambda: MESHES,
+        "prior": lambda: st.sampled_from(["smooth", "total_variation"]),
         "metric": lambda: st.sampled_from(["auto", "material", "stiffness"]),
     }
     return table[kind]() if kind in table else None

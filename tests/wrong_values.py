@@ -218,6 +218,7 @@ def wrong_values(kind: str, good, problem) -> dict:
         "source": lambda: NO_SETTING | {"path": Path("a.obj"), "array": MESH.vertices},
         "axis": lambda: no_arrays(problem) | NO_AXIS,
         "dtype": lambda: NO_SETTING | {"half": np.float16, "integer": int, "name": "north"},
+        "prior": lambda: {"list": ["smooth"], "word": "rough", "number": 1, "array": MESH.vertices},
         "metric": lambda: {"none": None, "list": ["auto"], "word": "A", "array": MESH.vertices},
         "progress": lambda: {"text": "print", "number": 5, "mesh": MESH},
         "turn": lambda: NO_SETTING | {"bool": True, "huge": 10**5000, "array": np.ones(2)},

@@ -21,6 +21,8 @@ _CG_TOLERANCE, _CG_STEPS = 3e-2, 30
 _TOGETHER = 256
 # Constants cost nothing under the Laplacian; where it must be inverted, they cost a little.
 _SHIFT = 1e-2
+# Total variation takes differences of log rigidity below this for none.
+FLAT = 1e-2
 
 
 class Prior(NamedTuple):
@@ -37,11 +39,18 @@ class Prior(NamedTuple):
     """Of L, made definite: the preconditioner."""
 
     @classmethod
-    def of(cls, problem: Problem) -> "Prior":
-        """Set up the prior of a problem's mesh."""
+    def of(cls, problem: Problem, near: Float[np.ndarray, "vertices"] | None = None) -> "Prior":
+        """Set up the prior of a problem's mesh.
+
+        With a field, that of total variation near it: each square is divided by the present size of
+        its difference in units of `FLAT`, or by 1 where that is less (reweighted least squares).
+        """
         mesh = problem.mesh
         # Negative weights would reward differences.
         weights = lifted_weights(cotangent_weights(mesh))
+        if near is not None:
+            i, j = mesh.edges.T
+            weights = weights * FLAT / np.maximum(np.abs(near[i] - near[j]), FLAT)
         laplacian = graph_laplacian(mesh.edges, weights, mesh.n_vertices)
         shifted = laplacian + _SHIFT * sp.identity(mesh.n_vertices)
         everywhere = np.ones(mesh.n_vertices, bool)
@@ -52,6 +61,10 @@ class Prior(NamedTuple):
     def differences(self, theta: Float[Array, "vertices"]) -> Float[Array, "edges"]:
         """Return weighted differences: the sum of their squares is the prior."""
         return self.root * (theta[self.edges[:, 0]] - theta[self.edges[:, 1]])
+
+    def value(self, theta: Float[Array, "vertices"]) -> float:
+        """Return what a field costs."""
+        return float(jnp.sum(self.differences(theta) ** 2))
 
     def product(
         self, vectors: Float[Array, "vertices columns"]
