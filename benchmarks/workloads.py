@@ -25,10 +25,13 @@ class Workload:
     mesh: jd.Mesh
     handles: np.ndarray
     targets: np.ndarray
+    other_start: np.ndarray | None = None
 
     @cached_property
     def start(self) -> np.ndarray:
-        """The start that all methods get: Laplacian editing."""
+        """The start that all methods get: Laplacian editing, unless another was given."""
+        if self.other_start is not None:
+            return self.other_start
         return np.array(jd.laplacian_editing(self.mesh, self.handles, self.targets))
 
     def reduced_energy(self, problem: jd.Problem, vertices, rigidity, local: jd.LocalStep) -> float:
