@@ -127,7 +127,7 @@ class PeerDescent(NamedTuple):
     def note(self) -> str:
         """What the table says of it."""
         above = 100 * self.energies[-1]
-        where = "" if above < 100 * NEAR else f", {above:.2g} % above our rigid minimum"
+        where = "" if above <= 100 * NEAR else f", {above:.2g} % above our rigid minimum"
         return f"{self.steps} iterations{where}"
 
 
@@ -144,7 +144,7 @@ def peer_descent(
     energies: list[float] = []
     while len(energies) < MOST // 10 and not (energies and energies[-1] <= NEAR):
         energies.append(load.reduced_energy(problem, go_on(), 0.0, local) / least - 1.0)
-    near = max(min(energies), 0.0) + NEAR
+    near = NEAR if min(energies) <= NEAR else min(energies) + NEAR
     first = next(k for k, energy in enumerate(energies) if energy <= near)
     return PeerDescent(energies[: first + 1])
 

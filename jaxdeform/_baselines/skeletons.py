@@ -26,6 +26,15 @@ class Skeleton:
     joints: Float[np.ndarray, "joints 3"]
     bones: Int[np.ndarray, "bones 2"]
 
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for name in ("joints", "bones"):
+            object.__setattr__(self, name, read_only(np.array(getattr(self, name))))
+
+    def __reduce__(self):
+        """Pickle the content; loading freezes it again."""
+        return Skeleton, (self.joints, self.bones)
+
     @property
     def segments(self) -> Float[np.ndarray, "bones 2 3"]:
         """Both ends of each bone: the controls of the skinning weights."""
@@ -78,7 +87,7 @@ def load_skeleton(path: str | os.PathLike) -> Skeleton:
                 bones.append([i, j])
     if not bones:
         raise InputError(f"{path}: has {len(joints)} joints and no bones: is the line '#' missing?")
-    return Skeleton(read_only(np.array(joints)), read_only(np.array(bones)))
+    return Skeleton(np.array(joints), np.array(bones))
 
 
 def _joint(where: str, words: list[str], expected: int) -> list[float]:

@@ -32,6 +32,15 @@ class Submesh:
     index: Int[np.ndarray, "piece"]
     whole: Mesh
 
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for name in ("handles", "index"):
+            object.__setattr__(self, name, read_only(np.array(getattr(self, name))))
+
+    def __reduce__(self):
+        """Pickle the content; loading freezes it again."""
+        return Submesh, (self.mesh, self.cells, self.handles, self.index, self.whole)
+
     def reinsert(
         self, vertices: ArrayLike, base: ArrayLike | None = None
     ) -> Float[np.ndarray, "vertices 3"]:
@@ -114,4 +123,4 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     membership.eliminate_zeros()
     piece_cells = Cells(piece, cells.weights[edge], membership[index][:, edge].tocsr())
     held = np.flatnonzero(~is_free[index])
-    return Submesh(piece, piece_cells, read_only(held), read_only(index), mesh)
+    return Submesh(piece, piece_cells, held, index, mesh)

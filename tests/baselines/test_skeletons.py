@@ -1,5 +1,8 @@
 """Skeleton files, whole and broken."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -16,6 +19,11 @@ def test_reading_a_skeleton(tmp_path):
     np.testing.assert_array_equal(skeleton.bones, [[0, 1], [1, 2]])  # no cage edge, no pseudo edge
     np.testing.assert_array_equal(skeleton.segments[1], [[0, 1, 0], [0, 2.5, 0.1]])
     assert "4 joints, 2 bones" in repr(skeleton)
+    for one in (skeleton, pickle.loads(pickle.dumps(skeleton)), copy.deepcopy(skeleton)):
+        np.testing.assert_array_equal(one.segments, skeleton.segments)
+        for array in (one.joints, one.bones):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 5
     assert jd.inverse_distance_weights(np.ones((5, 3)), skeleton.segments).shape == (5, 2)
 
 

@@ -1,10 +1,24 @@
 """A piece deforms as it would within the whole."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from helpers import TWENTY, relative
 
 import jaxdeform as jd
+
+
+def test_a_copy_is_the_same_and_cannot_be_written(bar):
+    piece = jd.submesh(bar, bar.vertices[:, 1] > 100.0)
+    for one in (piece, pickle.loads(pickle.dumps(piece)), copy.deepcopy(piece), copy.copy(piece)):
+        assert one.mesh == piece.mesh
+        assert one.whole == bar
+        for name in ("handles", "index"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(piece, name))
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(one, name)[0] = 5
 
 
 @pytest.mark.slow
