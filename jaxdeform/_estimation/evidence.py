@@ -47,9 +47,11 @@ def find_patterns(run: Any, prior: Prior) -> Patterns:
     flat = np.linalg.solve(root, effects.reshape(-1, len(metric)).T).T
     _, lengths, turn = np.linalg.svd(flat, full_matrices=False)
     vectors = np.linalg.solve(root, vectors.T).T @ turn.T
-    seen = np.asarray(run.jacobian.mv(run.theta - jnp.mean(run.theta)) - run.residual, float)
+    count = int(prior.inside.sum())
+    mean = np.mean(np.asarray(run.theta)[:count])
+    seen = np.asarray(run.jacobian.mv(run.theta - mean) - run.residual, float)
     data = turn @ (flat.T @ seen.ravel())
-    return Patterns(vectors, lengths**2, data, float(np.sum(seen**2)))
+    return Patterns(vectors[:count], lengths**2, data, float(np.sum(seen**2)))
 
 
 @eqx.filter_jit

@@ -134,16 +134,16 @@ def estimate_rigidity_field(
     noise = search.evidence(smooth.patterns, (smooth.weight, smooth.weight)).noise
     variances = search.prior.variances()
     spread = deviations(smooth.patterns, variances, Evidence(smooth.weight, noise))
-    center = np.asarray(smooth.run.theta, np.float64)
+    center = smooth.theta(problem)
     ends = _NORMAL_95 * spread[:, None] * np.array([-1.0, 1.0])
     found = smooth if prior == "smooth" else search.flatten(smooth, smoothness)
     out = FieldEstimate(
-        field=np.exp(np.asarray(found.run.theta, np.float64)),
+        field=np.exp(found.theta(problem)),
         interval=np.exp(center[:, None] + ends),
         determined=ends[:, 1] <= np.log(10.0),
         smoothness=found.weight / problem.mesh.diagonal**2,
         noise=noise,
-        vertices=np.asarray(found.run.vertices),
+        vertices=found.vertices(problem),
         misfit=poses.root_mean_square(np.asarray(found.run.residual)),
         history=np.array(search.history),
         result=found.result,

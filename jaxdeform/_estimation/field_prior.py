@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._deformation.problem import Problem
+from jaxdeform._linalg.buckets import bucket, enlarge, fill_up
 from jaxdeform._linalg.cholesky import Factor, factorise
 from jaxdeform._mesh.laplacian import cotangent_weights, graph_laplacian, lifted_weights
 
@@ -28,13 +29,16 @@ FLAT = 1e-2
 class Prior(NamedTuple):
     """The cotangent Laplacian L of log rigidity t, as a sum over the edges.
 
-    ``t^T L t`` is the integral of |grad t|^2 over the surface: a pure number.
+    ``t^T L t`` is the integral of |grad t|^2 over the surface: a pure number. All arrays have the
+    size of the problem's bucket, so that meshes of about one size share the compiled code: behind
+    the last vertex are some that no edge touches, behind the last edge some of weight 0.
     """
 
     root: Float[Array, "edges"]
     """Square roots of the edge weights."""
     edges: Int[Array, "edges 2"]
-    n_vertices: int
+    inside: Bool[Array, "vertices"]
+    """False for those behind the last vertex of the mesh."""
     factor: Factor
     """Of L, made definite: the preconditioner."""
 
@@ -51,12 +55,17 @@ class Prior(NamedTuple):
         if near is not None:
             i, j = mesh.edges.T
             weights = weights * FLAT / np.maximum(np.abs(near[i] - near[j]), FLAT)
-        laplacian = graph_laplacian(mesh.edges, weights, mesh.n_vertices)
-        shifted = laplacian + _SHIFT * sp.identity(mesh.n_vertices)
-        everywhere = np.ones(mesh.n_vertices, bool)
-        factor = factorise(shifted.tocsr(), everywhere, problem.dtype, positions=mesh.vertices)
-        root = jnp.asarray(np.sqrt(weights), problem.dtype)
-        return cls(root, jnp.asarray(mesh.edges, jnp.int32), mesh.n_vertices, factor)
+        size = problem.bucket
+        laplacian = enlarge(graph_laplacian(mesh.edges, weights, mesh.n_vertices), size)
+        shifted = laplacian + _SHIFT * sp.identity(size)
+        positions = fill_up(mesh.vertices.T, size).T
+        factor = factorise(shifted.tocsr(), np.ones(size, bool), problem.dtype, positions=positions)
+        most = max(bucket(len(weights)), bucket(3 * size))  # closed meshes have 3 edges a vertex
+        root = fill_up(np.sqrt(weights).astype(problem.dtype), most)
+        edges = fill_up(mesh.edges.T.astype(np.int32), most).T
+        inside = fill_up(np.ones(mesh.n_vertices, bool), size)
+        root, edges, inside = jax.device_put((root, edges, inside))
+        return cls(root, edges, inside, factor)
 
     def differences(self, theta: Float[Array, "vertices"]) -> Float[Array, "edges"]:
         """Return weighted differences: the sum of their squares is the prior."""
@@ -76,11 +85,11 @@ class Prior(NamedTuple):
 
     def variances(self) -> Float[np.ndarray, "vertices"]:
         """Return the diagonal of the inverse of L, made definite: one solve for each vertex."""
-        n = self.n_vertices
+        n, unknowns = int(self.inside.sum()), np.arange(len(self.inside))
         found = np.empty(n)
         for first in range(0, n, _TOGETHER):
             at = np.arange(first, first + _TOGETHER)
-            unit = (np.arange(n) == at[:, None]).astype(self.root.dtype)
+            unit = (unknowns == at[:, None]).astype(self.root.dtype)
             inside = at[at < n]
             found[inside] = np.asarray(self.factor.solve(jnp.asarray(unit)))[inside - first, inside]
         return found

@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.system import System
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
 from jaxdeform._estimation.deformed import Known, as_known, pose, states
 from jaxdeform._estimation.evidence import Evidence, Patterns, find_patterns, most_probable
@@ -51,7 +53,8 @@ class FieldSearch:
     """The search, under one weight of the prior after the other."""
 
     def __init__(self, problem, poses, bounds, solver, adjoint, limit: int, progress) -> None:
-        self.problem, self.poses, self.bounds = problem, poses, bounds
+        self.problem, self.poses, self.seen = problem, poses, _Observed.of(problem, poses)
+        self.bounds = fill_up(bounds, problem.bucket)
         self.solver, self.adjoint, self.limit, self.progress = solver, adjoint, limit, progress
         self.prior = Prior.of(problem)
         self.history: list[float] = []
@@ -59,7 +62,7 @@ class FieldSearch:
     def run(self, theta, smoothness: float | None) -> "FieldFound":
         """Search under the smoothness given, or under the one that the poses make most probable."""
         weights = self.problem.mesh.diagonal**2 * _stages(smoothness or _FIRST)
-        found = self._relax(self._evaluate(theta), weights)
+        found = self._relax(self._evaluate(fill_up(theta, self.problem.bucket)), weights)
         return found if smoothness else self._most_probable(found)
 
     def flatten(self, found: "FieldFound", smoothness: float | None) -> "FieldFound":
@@ -71,18 +74,18 @@ class FieldSearch:
         freedom = np.sum(strength / (strength + found.weight))
         most = np.inf
         if smoothness is None:
-            most = self._misfit(found) * np.sqrt(count / max(count - freedom, 1.0))
+            most = self._misfit(found.run) * np.sqrt(count / max(count - freedom, 1.0))
             most *= 1.0 + 1.0 / np.sqrt(2.0 * count)  # it is known to that
         for turn in range(_REWEIGHTINGS):
             theta, before = found.run.theta, self.prior
-            self.prior = Prior.of(self.problem, np.asarray(theta))
+            self.prior = Prior.of(self.problem, np.asarray(theta)[: self.problem.n_vertices])
             # As strong as the smooth prior at first.
             stronger = _STRONGER if turn else before.value(theta) / self.prior.value(theta)
             weight = found.weight * (1.0 if smoothness else stronger)
             new = self._relax(found.run, np.array([weight]))
             if not succeeded(new.result):
                 return found._replace(result=new.result)
-            if self._misfit(new) > most:
+            if self._misfit(new.run) > most:
                 break
             moved = jnp.abs(new.run.theta - theta).max()
             found = new
@@ -90,8 +93,8 @@ class FieldSearch:
                 break
         return found
 
-    def _misfit(self, found: "FieldFound") -> float:
-        return self.poses.root_mean_square(np.asarray(found.run.residual))
+    def _misfit(self, run: "_Linearised") -> float:
+        return self.poses.root_mean_square(np.asarray(run.residual))
 
     def _most_probable(self, found: "FieldFound") -> "FieldFound":
         """Search on, under the smoothness that the poses make most probable."""
@@ -126,11 +129,16 @@ class FieldSearch:
         return search(evaluate, first, solver, limit)
 
     def _evaluate(self, theta: np.ndarray) -> "_Linearised":
-        point = jnp.asarray(theta, self.problem.dtype)
-        run = _linearise(self.problem, self.poses, point, self.solver, self.adjoint)
-        self.history.append(self.poses.root_mean_square(np.asarray(run.residual)))
+        problem, settings = self.problem, (self.solver, self.adjoint)
+        field = np.exp(theta[: problem.n_vertices])
+        ends = states(problem, self.poses, field, *settings)
+        each = [as_known(problem, *x) for x in zip(self.poses.targets, ends, strict=True)]
+        known = jax.tree.map(lambda *x: np.stack(x), *each)
+        point = jnp.asarray(theta, problem.dtype)
+        run = settled(_linearise(problem.system, self.seen, known, point, *settings))
+        self.history.append(self._misfit(run))
         if self.progress is not None:
-            self.progress(len(self.history), self.history[-1], np.exp(theta))
+            self.progress(len(self.history), self.history[-1], field)
         return run
 
 
@@ -138,30 +146,38 @@ class FieldSearch:
 
 
 class _Linearised(NamedTuple):
-    """One evaluation: deformed poses and their derivative, without the prior."""
+    """One evaluation: deformed poses and their derivative, without the prior.
+
+    Arrays have the size of the problem's bucket; positions are relative to the centre.
+    """
 
     theta: Float[Array, "vertices"]
-    vertices: Float[Array, "poses vertices 3"]
-    residual: Float[Array, "poses vertices 3"]
+    vertices: Float[Array, "poses 3 vertices"]
+    residual: Float[Array, "poses 3 vertices"]
     jacobian: lx.FunctionLinearOperator
 
 
-def _linearise(problem, poses: Poses, theta, solver, adjoint) -> _Linearised:
-    ends = states(problem, poses, np.exp(theta), solver, adjoint)
-    each = [as_known(problem, *x) for x in zip(poses.targets, ends, strict=True)]
-    known = jax.tree.map(lambda *x: np.stack(x), *each)
-    return settled(_linearise_at(problem, poses, theta, known, solver, adjoint))
+class _Observed(NamedTuple):
+    """What the poses are compared with, laid out in the same way."""
+
+    positions: Float[Array | np.ndarray, "poses 3 vertices"]
+    counted: Bool[Array | np.ndarray, "poses vertices"]
+
+    @classmethod
+    def of(cls, problem: Problem, poses: Poses) -> "_Observed":
+        """Lay out the poses of a problem."""
+        relative = np.swapaxes(poses.observed - problem.mesh.center, 1, 2).astype(problem.dtype)
+        return cls(*(fill_up(x, problem.bucket) for x in (relative, poses.counted)))
 
 
 @eqx.filter_jit
-def _linearise_at(problem, poses: Poses, theta, known: Known, solver, adjoint) -> _Linearised:
-    system = problem.system
+def _linearise(system: System, seen: _Observed, known: Known, theta, solver, adjoint):
+    """Return the evaluation at theta: the same code for all meshes of a bucket."""
 
     def run(theta):
-        field = fill_up(jnp.exp(theta), problem.bucket)
-        each = jax.lax.map(lambda one: pose(system, one, field, solver, adjoint), known)
-        vertices = jnp.swapaxes(each[..., : problem.n_vertices], 1, 2) + system.center[None, None]
-        residual = jnp.where(poses.counted[..., None], vertices - poses.observed, 0.0)
+        field = jnp.exp(theta)
+        vertices = jax.lax.map(lambda one: pose(system, one, field, solver, adjoint), known)
+        residual = jnp.where(seen.counted[:, None], vertices - seen.positions, 0.0)
         return residual, vertices
 
     residual, push, vertices = jax.linearize(run, theta, has_aux=True)
@@ -176,6 +192,15 @@ class FieldFound(NamedTuple):
     weight: float
     result: Result
     patterns: Patterns
+
+    def theta(self, problem: Problem) -> Float[np.ndarray, "vertices"]:
+        """Return the logarithm of the field."""
+        return np.asarray(self.run.theta, np.float64)[: problem.n_vertices]
+
+    def vertices(self, problem: Problem) -> Float[np.ndarray, "poses vertices 3"]:
+        """Return the fitted poses."""
+        relative = np.asarray(self.run.vertices)[..., : problem.n_vertices]
+        return np.swapaxes(relative, 1, 2) + problem.mesh.center.astype(relative.dtype)
 
 
 class _FieldFit(NamedTuple):

@@ -37,8 +37,8 @@ class Poses(NamedTuple):
         """Number of coordinates compared."""
         return 3 * int(np.sum(self.counted))
 
-    def root_mean_square(self, residual: Float[np.ndarray, "poses vertices 3"]) -> float:
-        """Return the misfit: a length."""
+    def root_mean_square(self, residual: Float[np.ndarray, "..."]) -> float:
+        """Return the misfit, a length: of residuals that are 0 where nothing counts."""
         return float(np.sqrt(np.sum(residual**2) / max(self.count, 1)))
 
 

@@ -156,6 +156,14 @@ def estimate_of_observed_handles(mesh):
     return jd.estimate_rigidity(problem, np.asarray(out.vertices) + wave)
 
 
+def estimate_of_a_field(mesh):
+    """Its patterns are found by random numbers, which depend on the bucket, too."""
+    problem, targets = setting(mesh)
+    out = jd.deform(problem, targets, 0.1 + 0.05 * mesh.vertices[:, 1])
+    settings = {"targets": targets, "smoothness": 1e-4, "max_evaluations": 3}
+    return jd.estimate_rigidity_field(problem, out.vertices, **settings)
+
+
 QUICK = [plain, with_normals, editing, constants, minimality_and_energy]
 SLOW = [
     field_and_start_and_soft_handles,
@@ -206,7 +214,8 @@ def test_single_precision(mesh, monkeypatch):
 
 # Derivatives to the rest shape go edge by edge, and meshes of a bucket differ in their edges.
 SHARED = [call for call in CALLS if gradient_to_rest not in getattr(call, "values", ())]
-SHARED += [pytest.param(estimate_of_observed_handles, marks=pytest.mark.slow)]
+OF_ESTIMATES = [estimate_of_observed_handles, estimate_of_a_field]
+SHARED += [pytest.param(call, marks=pytest.mark.slow) for call in OF_ESTIMATES]
 # What JAX runs one by one while it traces an eager call: cutting off what fills up, the loss of
 # these tests, and the transposes of both. No loop, no factor, no product with K.
 CUT = {"slice", "dynamic_slice", "squeeze", "pad", "_pad", "convert_element_type"}
