@@ -22,6 +22,8 @@ REAL = Path(__file__).parents[2] / "shared" / "meshes"
 
 TWENTY = jd.Alternating(steps=20)
 TIGHT = jd.QuasiNewton(tolerance=1e-15)
+# The look for saddles takes half the time of compilation. Others test it.
+NO_SADDLES = jd.QuasiNewton(leave_saddles=False)
 THESIS = jd.Alternating(steps=100)
 
 NOISE = 1e-4

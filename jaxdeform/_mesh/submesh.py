@@ -67,7 +67,9 @@ def submesh(mesh: Mesh, free: ArrayLike, cells: Cells | None = None) -> Submesh:
     """Cut out the cells that contain a free vertex, and nothing else.
 
     A cell whose vertices are all fixed has a fixed transformation, so it can be left out: the piece
-    deforms exactly as it would within the whole mesh (up to rounding).
+    deforms exactly as it would within the whole mesh (up to rounding). Handles of the whole mesh
+    that are not in the piece touch none of its cells, so they play no part: give targets to
+    ``handles`` of the piece, in its own numbers.
 
     **Arguments**
 

@@ -10,6 +10,7 @@ import jaxdeform as jd
 from jaxdeform._linalg import lbfgs
 
 
+@pytest.mark.slow
 def test_vmap_over_targets_rigidity_and_start(bar, bar_problem, bar_targets):
     targets = jnp.stack([jnp.asarray(bar_targets), jnp.asarray(bar_targets) + 3.0])
     lam = jnp.asarray([0.1, 10.0])

@@ -6,15 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import without_buckets
+from helpers import NO_SADDLES, without_buckets
 
 import jaxdeform as jd
 from benchmarks.harness import compilations
 from jaxdeform._linalg.buckets import bucket
 
 AROUND = 8
-# It takes half the time of compilation. Others look for saddles.
-NO_SADDLES = jd.QuasiNewton(leave_saddles=False)
 
 
 def tube(rows: int) -> jd.Mesh:

@@ -113,6 +113,7 @@ def test_derivatives_by_differences(local):
     np.testing.assert_allclose(both, jnp.sum(weight * tangent), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("local", [jd.Newton(), jd.RotationFit(), jd.AffineFit()], ids=name)
 def test_second_derivatives_are_the_differences_of_the_first(local):
     """In all orders of forward and reverse, at a known minimum. LBFGS has the rules of Newton."""

@@ -47,6 +47,7 @@ def sheet():
     return jd.precompute(mesh, handles), targets
 
 
+@pytest.mark.slow
 def test_another_material_reaches_its_own_equilibrium(sheet):
     """At the end A p' = K^T T: a further step moves nothing; another material ends elsewhere."""
     problem, targets = sheet
@@ -64,17 +65,13 @@ def test_another_material_reaches_its_own_equilibrium(sheet):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("local", "steps"), [(Corotated(), 1000), (jd.AffineFit(), 20_000)], ids=["corotated", "affine"]
-)
-def test_both_solvers_reach_the_minimum_of_another_energy(sheet, local, steps):
+def test_both_solvers_reach_the_minimum_of_another_energy(sheet):
     """QuasiNewton accepts steps by the energy of the law, not by that of Eq. 4.4."""
-    problem, targets = sheet
-    slow = jd.deform(problem, targets, 0.3, local=local, solver=jd.Alternating(steps))
+    (problem, targets), local = sheet, Corotated()
+    slow = jd.deform(problem, targets, 0.3, local=local, solver=jd.Alternating(1000))
     fast = jd.deform(problem, targets, 0.3, local=local, solver=jd.QuasiNewton(tolerance=1e-14))
     assert fast.result == jd.Result.converged
-    size = float(slow.energy[0])  # the affine fit ends at 0
-    np.testing.assert_allclose(fast.energy[-1], slow.energy[-1], atol=1e-12 * size)
+    np.testing.assert_allclose(fast.energy[-1], slow.energy[-1], rtol=1e-12)
     np.testing.assert_allclose(fast.vertices, slow.vertices, atol=1e-6)
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import NO_SADDLES
 
 import jaxdeform as jd
 
@@ -53,7 +54,8 @@ def test_each_mesh_is_as_if_alone(problems, targets, lam):
 @pytest.mark.slow
 def test_gradients_are_those_of_each_mesh(problems, targets):
     def height(problem, targets, lam):
-        return jnp.sum(jd.deform(problem, targets, lam).vertices[:, 2] ** 2)
+        out = jd.deform(problem, targets, lam, solver=NO_SADDLES)
+        return jnp.sum(out.vertices[:, 2] ** 2)
 
     stack, lam = jd.stack_problems(problems), jnp.asarray([0.1, 1.0, 10.0])
     found = jax.vmap(jax.grad(height, argnums=(1, 2)))(stack, jnp.asarray(targets), lam)

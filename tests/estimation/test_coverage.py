@@ -20,8 +20,8 @@ def draw():
     ("case", "seeds"),
     [
         (Case(1, True, 1e-3), 60),
-        (Case(1, False, 1e-3), 30),
-        (Case(2, True, 1e-3), 20),
+        (Case(1, False, 1e-3), 20),
+        (Case(2, True, 1e-3), 12),
     ],
 )
 def test_intervals_cover_the_truth(draw, case, seeds):

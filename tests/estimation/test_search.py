@@ -261,7 +261,11 @@ def test_optimistix_ends_at_the_same_minimum(bar, bar_problem, bar_targets, pose
 
 @pytest.mark.parametrize(
     "estimate",
-    [jd.estimate_rigidity, jd.estimate_rigidity_field, jd.estimate_rigidity_thesis],
+    [
+        jd.estimate_rigidity,
+        pytest.param(jd.estimate_rigidity_field, marks=pytest.mark.slow),
+        jd.estimate_rigidity_thesis,
+    ],
     ids=["parts", "field", "thesis"],
 )
 def test_throw_raises_what_the_result_says(estimate):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EXACT, FD, TWENTY
+from helpers import EXACT, FD, NO_SADDLES, TWENTY
 from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
@@ -54,7 +54,8 @@ def test_derivatives_to_the_rest_shape_leave_them_out(pair):
         problem = jd.precompute(mesh, handles)
 
         def height(rest, problem=problem):
-            return jnp.sum(jd.deform(problem, targets, 1.0, rest=rest).vertices[4] ** 2)
+            out = jd.deform(problem, targets, 1.0, rest=rest, solver=NO_SADDLES)
+            return jnp.sum(out.vertices[4] ** 2)
 
         slopes.append(jax.grad(height)(jnp.asarray(mesh.vertices)))
     assert np.abs(slopes[0]).max() > 0.01
