@@ -136,7 +136,9 @@ def estimate_rigidity_field(
     spread = deviations(smooth.patterns, variances, Evidence(smooth.weight, noise))
     center = smooth.theta(problem)
     ends = _NORMAL_95 * spread[:, None] * np.array([-1.0, 1.0])
-    found = smooth if prior == "smooth" else search.flatten(smooth, smoothness)
+    found = smooth
+    if prior == "total_variation" and succeeded(smooth.result):
+        found = search.flatten(smooth, smoothness)
     out = FieldEstimate(
         field=np.exp(found.theta(problem)),
         interval=np.exp(center[:, None] + ends),

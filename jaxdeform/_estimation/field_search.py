@@ -72,16 +72,20 @@ class FieldSearch:
         """
         strength, count = found.patterns.strength, self.poses.count
         freedom = np.sum(strength / (strength + found.weight))
-        most = np.inf
+        most = strongest = np.inf
         if smoothness is None:
+            strongest = self.problem.mesh.diagonal**2 * _SMOOTHEST / FLAT
             most = self._misfit(found.run) * np.sqrt(count / max(count - freedom, 1.0))
             most *= 1.0 + 1.0 / np.sqrt(2.0 * count)  # it is known to that
         for turn in range(_REWEIGHTINGS):
             theta, before = found.run.theta, self.prior
             self.prior = Prior.of(self.problem, np.asarray(theta)[: self.problem.n_vertices])
-            # As strong as the smooth prior at first.
-            stronger = _STRONGER if turn else before.value(theta) / self.prior.value(theta)
+            # As strong as the smooth prior at first. (A constant field costs nothing under either.)
+            costs = [max(prior.value(theta), 1e-300) for prior in (before, self.prior)]
+            stronger = _STRONGER if turn else costs[0] / costs[1]
             weight = found.weight * (1.0 if smoothness else stronger)
+            if weight > strongest:
+                break
             new = self._relax(found.run, np.array([weight]))
             if not succeeded(new.result):
                 return found._replace(result=new.result)
