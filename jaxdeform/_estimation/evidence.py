@@ -47,7 +47,7 @@ def find_patterns(run: Any, prior: Prior) -> Patterns:
     flat = np.linalg.solve(root, effects.reshape(-1, len(metric)).T).T
     _, lengths, turn = np.linalg.svd(flat, full_matrices=False)
     vectors = np.linalg.solve(root, vectors.T).T @ turn.T
-    count = int(prior.inside.sum())
+    count = prior.n_vertices
     mean = np.mean(np.asarray(run.theta)[:count])
     seen = np.asarray(run.jacobian.mv(run.theta - mean) - run.residual, float)
     data = turn @ (flat.T @ seen.ravel())

@@ -146,7 +146,7 @@ def estimate_rigidity_field(
         smoothness=found.weight / problem.mesh.diagonal**2,
         noise=noise,
         vertices=found.vertices(problem),
-        misfit=poses.root_mean_square(np.asarray(found.run.residual)),
+        misfit=search.misfit(found.run),
         history=np.array(search.history),
         result=found.result,
     )

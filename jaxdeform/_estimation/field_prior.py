@@ -67,6 +67,11 @@ class Prior(NamedTuple):
         root, edges, inside = jax.device_put((root, edges, inside))
         return cls(root, edges, inside, factor)
 
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices of the mesh."""
+        return int(np.count_nonzero(self.inside))
+
     def differences(self, theta: Float[Array, "vertices"]) -> Float[Array, "edges"]:
         """Return weighted differences: the sum of their squares is the prior."""
         return self.root * (theta[self.edges[:, 0]] - theta[self.edges[:, 1]])
@@ -85,7 +90,7 @@ class Prior(NamedTuple):
 
     def variances(self) -> Float[np.ndarray, "vertices"]:
         """Return the diagonal of the inverse of L, made definite: one solve for each vertex."""
-        n, unknowns = int(self.inside.sum()), np.arange(len(self.inside))
+        n, unknowns = self.n_vertices, np.arange(len(self.inside))
         found = np.empty(n)
         for first in range(0, n, _TOGETHER):
             at = np.arange(first, first + _TOGETHER)

@@ -20,7 +20,7 @@ from jaxdeform._estimation.deformed import Known, as_known, pose, states
 from jaxdeform._estimation.evidence import Evidence, Patterns, find_patterns, most_probable
 from jaxdeform._estimation.field_prior import FLAT, Prior, Solve, WithPrior
 from jaxdeform._estimation.poses import Poses, same_length
-from jaxdeform._estimation.search import Found, search
+from jaxdeform._estimation.search import search
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.waiting import settled
 from jaxdeform._result import Result, succeeded
@@ -68,36 +68,38 @@ class FieldSearch:
     def flatten(self, found: "FieldFound", smoothness: float | None) -> "FieldFound":
         """Search on under total variation, with the smoothness given or the most that poses allow.
 
-        That is where the misfit still is that of the noise (Morozov's discrepancy principle).
+        That is where the misfit still is that of the noise (Morozov's discrepancy principle). The
+        patterns stay those under the smooth prior.
         """
         strength, count = found.patterns.strength, self.poses.count
         freedom = np.sum(strength / (strength + found.weight))
         most = strongest = np.inf
         if smoothness is None:
             strongest = self.problem.mesh.diagonal**2 * _SMOOTHEST / FLAT
-            most = self._misfit(found.run) * np.sqrt(count / max(count - freedom, 1.0))
+            most = self.misfit(found.run) * np.sqrt(count / max(count - freedom, 1.0))
             most *= 1.0 + 1.0 / np.sqrt(2.0 * count)  # it is known to that
         for turn in range(_REWEIGHTINGS):
             theta, before = found.run.theta, self.prior
-            self.prior = Prior.of(self.problem, np.asarray(theta)[: self.problem.n_vertices])
+            self.prior = Prior.of(self.problem, found.theta(self.problem))
             # As strong as the smooth prior at first. (A constant field costs nothing under either.)
             costs = [max(prior.value(theta), 1e-300) for prior in (before, self.prior)]
             stronger = _STRONGER if turn else costs[0] / costs[1]
             weight = found.weight * (1.0 if smoothness else stronger)
             if weight > strongest:
                 break
-            new = self._relax(found.run, np.array([weight]))
-            if not succeeded(new.result):
-                return found._replace(result=new.result)
-            if self._misfit(new.run) > most:
+            run, result = self._descend(found.run, weight, self._left)
+            if not succeeded(result):
+                return found._replace(result=result)
+            if self.misfit(run) > most:
                 break
-            moved = jnp.abs(new.run.theta - theta).max()
-            found = new
+            found = found._replace(run=run, weight=float(weight), result=result)
+            moved = jnp.abs(run.theta - theta).max()
             if smoothness and moved < FLAT:
                 break
         return found
 
-    def _misfit(self, run: "_Linearised") -> float:
+    def misfit(self, run: "_Linearised") -> float:
+        """Return the misfit of an evaluation: a length."""
         return self.poses.root_mean_square(np.asarray(run.residual))
 
     def _most_probable(self, found: "FieldFound") -> "FieldFound":
@@ -120,17 +122,21 @@ class FieldSearch:
     def _relax(self, run, weights) -> "FieldFound":
         """Search under each weight, under the last to the end."""
         for weight in weights[:-1]:
-            run = self._descend(run, weight, _STAGE_EVALUATIONS).best.run
-        left = self.limit - len(self.history)
-        found = self._descend(run, weights[-1], max(left, 0))
-        run = found.best.run
-        return FieldFound(run, float(weights[-1]), found.result, find_patterns(run, self.prior))
+            run, _ = self._descend(run, weight, _STAGE_EVALUATIONS)
+        run, result = self._descend(run, weights[-1], self._left)
+        return FieldFound(run, float(weights[-1]), result, find_patterns(run, self.prior))
 
-    def _descend(self, run, weight, limit: int) -> Found:
+    @property
+    def _left(self) -> int:
+        """Evaluations that are left."""
+        return max(self.limit - len(self.history), 0)
+
+    def _descend(self, run, weight, limit: int) -> tuple["_Linearised", Result]:
         first = _FieldFit(run, self.prior, jnp.asarray(weight, run.theta.dtype))
         solver = ray_solver(self.bounds[0], self.bounds[1], first.solve, _GAIN)
         evaluate = lambda theta: first._replace(run=self._evaluate(theta))  # noqa: E731
-        return search(evaluate, first, solver, limit)
+        found = search(evaluate, first, solver, limit)
+        return found.best.run, found.result
 
     def _evaluate(self, theta: np.ndarray) -> "_Linearised":
         problem, settings = self.problem, (self.solver, self.adjoint)
@@ -140,7 +146,7 @@ class FieldSearch:
         known = jax.tree.map(lambda *x: np.stack(x), *each)
         point = jnp.asarray(theta, problem.dtype)
         run = settled(_linearise(problem.system, self.seen, known, point, *settings))
-        self.history.append(self._misfit(run))
+        self.history.append(self.misfit(run))
         if self.progress is not None:
             self.progress(len(self.history), self.history[-1], field)
         return run
