@@ -139,7 +139,7 @@ class Implicit:
             metric = metric_of(system, energy.local, inputs.rigidity)
             precondition = lambda x: apply_metric(system, metric, x) + system.held(x)  # noqa: E731
             (p, transforms), found = self._to_minimum(energy, system, inputs, precondition, state)
-            hessian = HessianSolver(precondition, found, self.tolerance, self.max_steps, self.throw)
+            solver = HessianSolver(precondition, found, self.tolerance, self.max_steps, self.throw)
             p = p + known - jax.lax.stop_gradient(known)
 
             def gradient(free, inputs):
@@ -147,15 +147,15 @@ class Implicit:
                 return energy.evaluate(system, inputs, moved, transforms).gradient
 
             def newton(p, inputs):
-                slope, linear = jax.linearize(lambda x: gradient(x, inputs), p)
-                step = hessian.solve(lambda x: linear(x) + system.held(x), -slope)
+                slope, hessian = _slope_and_hessian(system, lambda x: gradient(x, inputs), p)
+                step = solver.solve(hessian, -slope)
                 return jnp.where(system.free[None], p + step, inputs.targets)
 
             # A Newton step of size 0, whose derivatives need no rule.
             p = with_derivative_of(newton, p, p, inputs)
-            _, linear = jax.linearize(lambda x: gradient(x, inputs), p)
+            _, hessian = _slope_and_hessian(system, lambda x: gradient(x, inputs), p)
             _, right = jax.jvp(lambda inputs: gradient(p, inputs), (inputs,), (tangents[1],))
-            move = hessian.solve(lambda x: linear(x) + system.held(x), -right)
+            move = solver.solve(hessian, -right)
             move = jnp.where(system.free[None], move, tangents[1].targets)
             moves = move, Anchor(move, jnp.zeros_like(transforms))
             return (p, Anchor(p, transforms)), moves
@@ -188,3 +188,9 @@ class Implicit:
             return Step(moved, left, -dot(gradient, move), at.energy, at.rounding)
 
         return to_minimum(step, (p, jnp.zeros((3, *p.shape), p.dtype)))
+
+
+def _slope_and_hessian(system: System, gradient, p):
+    """Return the gradient at p, and the Hessian as a function; the identity for fixed vertices."""
+    slope, linear = jax.linearize(gradient, p)
+    return slope, lambda x: linear(x) + system.held(x)
