@@ -69,8 +69,14 @@ def _client(
             say(f"dashboard: {client.dashboard_link}")
             yield client
         return
-    # A block that loses its worker is tried again; worker.py counts how often.
-    with dask.config.set({"distributed.scheduler.allowed-failures": settings.tries * 100}):
+    with dask.config.set(
+        {
+            # A block that loses its worker is tried again; worker.py counts how often.
+            "distributed.scheduler.allowed-failures": settings.tries * 100,
+            # It keeps the call stacks of the last 1,000 s: 5 KiB for each small job.
+            "distributed.worker.profile.enabled": False,
+        }
+    ):
         try:
             cluster = LocalCluster(
                 n_workers=workers,
