@@ -61,6 +61,7 @@ from jaxdeform._mesh.selection import Selection
 from jaxdeform._mesh.submesh import Submesh, submesh
 from jaxdeform._plotting.animate import animate
 from jaxdeform._plotting.render import render, render_grid
+from jaxdeform._plotting.show import Turnable, show
 from jaxdeform._result import Result
 
 __version__ = "0.1.0"  # pyproject.toml reads it from here
@@ -95,6 +96,7 @@ __all__ = [
     "Solver",
     "Submesh",
     "ThesisEstimate",
+    "Turnable",
     "Unrolled",
     "Verdict",
     "animate",
@@ -142,6 +144,7 @@ __all__ = [
     "segment_rigidity",
     "select",
     "shapes",
+    "show",
     "spokes",
     "sr_arap",
     "stack_problems",

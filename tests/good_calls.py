@@ -27,7 +27,7 @@ WEIGHTS = {"vertices": MESH.vertices, "controls": TWO, "distances": np.ones((N, 
 _NOT_CALLED = (
     "Adjoint Cells CoarseProblem Discrepancy Estimate FieldEstimate HandleFile InputError "
     "Inspection LocalStep Problem Result RigidGroup Selection Skeleton Solution Solver "
-    "ThesisEstimate Verdict enable_compilation_cache"
+    "ThesisEstimate Turnable Verdict enable_compilation_cache"
 )
 NOT_CALLED = set(_NOT_CALLED.split())
 NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
@@ -206,6 +206,15 @@ def good_calls(folder: Path) -> dict:
         "inverse_distance_weights": (jd.inverse_distance_weights, {**WEIGHTS, "power": 2.0}),
         "arap": (jd.arap, rigid),
         "rc_arap": (jd.rc_arap, {**rigid, "r": 1}),
+        "show": (
+            jd.show,
+            {
+                **{k: v for k, v in drawn.items() if k != "edges"},
+                "poses": [MESH.vertices],
+                "values": [np.ones(N)],
+                "width": 100,
+            },
+        ),
         "sr_arap": (
             jd.sr_arap,
             {

@@ -34,10 +34,11 @@ SAID |= {
 BATCHES = ("deform_batch", "deform_in_chunks")
 PICTURES = ("animate", "render", "render_grid")
 ALLOWED = {
-    **{(name, "up"): {"none"} for name in PICTURES},  # guessed
+    **{(name, "up"): {"none"} for name in (*PICTURES, "show")},  # guessed
     # A broken pose is drawn as far as it goes, and named.
     **{(name, "poses"): {"in a list: nan", "in a list: jax nan"} for name in PICTURES},
-    **{(name, "moved"): {"none", "empty mask", "empty selection"} for name in PICTURES},
+    ("show", "poses"): {"none"},  # the rest shape
+    **{(name, "moved"): {"none", "empty mask", "empty selection"} for name in (*PICTURES, "show")},
     **{(name, "memory"): {"2**31"} for name in BATCHES},
     # In a batch only the member is at fault: its result says so.
     **{

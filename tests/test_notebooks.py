@@ -53,7 +53,7 @@ def test_every_notebook_is_on_the_site_and_has_a_test():
 @pytest.fixture
 def run(tmp_path):
     """Run a notebook at its reduced size; return what named expressions are worth at its end."""
-    for package in ("nbformat", "nbclient", "ipykernel", "matplotlib", "pyvista"):
+    for package in ("nbformat", "nbclient", "ipykernel", "matplotlib", "pyvista", "k3d"):
         pytest.importorskip(package, reason="needs the notebook extra")
     import nbformat
 

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = int(os.environ.get("JAXDEFORM_RANDOM_CALLS", "3"))
 # Files are the business of fuzz.py, pictures that of tests/plotting.
-LEFT_OUT = {"animate", "render", "render_grid", "save_mesh", "load_handles", "load_mesh"}
+LEFT_OUT = {"animate", "render", "render_grid", "show", "save_mesh", "load_handles", "load_mesh"}
 LEFT_OUT |= {"load_rigidity", "load_skeleton"}
 
 

@@ -26,8 +26,7 @@ def check_picture_path(path: Path, *suffixes: str) -> None:
         kinds = " or ".join(suffix[1:].upper() for suffix in suffixes)
         kind = "pictures" if ".png" in suffixes else "films"
         raise InputError(f"{path}: {kind} are {kinds} files: use a {' or '.join(suffixes)} name")
-    if find_spec("pyvista") is None:
-        raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'")
+    check_can_draw()
     if path.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise InputError(
             f"{path}: MP4 films need imageio-ffmpeg: pip install imageio-ffmpeg, or use a .gif name"
@@ -35,13 +34,24 @@ def check_picture_path(path: Path, *suffixes: str) -> None:
     check_place(path)
 
 
-def write_png(path: Path, image: Picture) -> None:
-    """Write a picture, as a whole or not at all."""
+def check_can_draw() -> None:
+    """Raise InputError where pyvista is not installed."""
+    if find_spec("pyvista") is None:
+        raise InputError("pictures need pyvista: pip install 'jaxdeform[viewer]'")
+
+
+def png(image: Picture) -> bytes:
+    """Return a picture as a PNG file."""
     from PIL import Image  # comes with pyvista
 
     content = BytesIO()
     Image.fromarray(image).save(content, format="PNG", optimize=True)
-    write_atomically(path, content.getvalue())
+    return content.getvalue()
+
+
+def write_png(path: Path, image: Picture) -> None:
+    """Write a picture, as a whole or not at all."""
+    write_atomically(path, png(image))
 
 
 def write_film(path: Path, images: Sequence[Picture], milliseconds: int) -> None:

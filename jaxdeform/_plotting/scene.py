@@ -65,7 +65,7 @@ class Stage:
         plotter = self.plotter
         plotter.clear_actors()
         # Single precision is enough near the origin and at size 1, whatever the mesh's unit.
-        pose = _within_reach((pose - view.focus) / view.depth)
+        pose = within_reach((pose - view.focus) / view.depth)
         self._add_surface(pose, colors)
         if dots is not None:
             self._add_dots(pose, dots)
@@ -129,7 +129,7 @@ class Stage:
                 )
 
 
-def _within_reach(pose: np.ndarray) -> np.ndarray:
+def within_reach(pose: np.ndarray) -> np.ndarray:
     """Pull what flies off toward the middle until single precision can hold it, out of view."""
     scale = np.abs(pose).max(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
