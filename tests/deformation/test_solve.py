@@ -64,10 +64,12 @@ def test_single_precision(bar, bar_problem, bar_targets):
     low = jd.deform(problem, bar_targets, 1.0)
     assert low.vertices.dtype == jnp.float32
     assert bool(low.ok)
-    assert relative(low.vertices, jd.deform(bar_problem, bar_targets, 1.0).vertices) < 1e-3
-    assert float(low.energy[-1]) < 1.001 * float(
-        jd.deform(bar_problem, bar_targets, 1.0).energy[-1]
-    )
+    high = jd.deform(bar_problem, bar_targets, 1.0)
+    assert relative(low.vertices, high.vertices) < 1e-3
+    found = [np.asarray(x, np.float64) for x in (low.vertices, low.transforms)]
+    assert jd.energy(bar_problem, *found, 1.0) < (1 + 1e-5) * high.energy[-1]
+    # What it says of it is a difference of sums 600 times as large.
+    np.testing.assert_allclose(low.energy[-1], high.energy[-1], rtol=2e-3)
 
 
 def test_other_handles_do_not_recompile(bar, bar_targets, bar_problem):
