@@ -21,9 +21,9 @@ _BOOLEAN = (bool, np.bool_)
 _NUMBER = (int, float, np.number, *_BOOLEAN)
 
 
-def is_concrete(x) -> bool:
-    """Return whether the values of an array can be read now; while JAX traces they cannot."""
-    return not isinstance(x, Tracer)
+def is_concrete(*trees) -> bool:
+    """Return whether all numbers of these can be read now; while JAX traces they cannot."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def as_array(value: ArrayLike, dtype: np.dtype, name: str) -> Array:

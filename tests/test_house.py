@@ -207,11 +207,17 @@ def test_citation_has_the_version_of_the_package():
     assert cited == jd.__version__
 
 
-def test_importing_loads_what_every_call_needs_and_no_more():
-    """SciPy loads its parts when they are named, and the rest is for pictures, files, clusters."""
+def test_importing_loads_what_is_used_and_no_more():
+    """Each public name loads its own; the rest is for estimates, pictures, files, clusters."""
     parts = ["stats", "optimize", "spatial", "interpolate", "sparse.csgraph", "sparse.linalg"]
-    heavy = [*(f"scipy.{part}" for part in parts), "jaxopt", "pyvista", "typer", "zarr", "dask"]
-    program = f"import sys, jaxdeform; print(*[x for x in {heavy} if x in sys.modules])"
+    heavy = [*(f"scipy.{part}" for part in parts), "jaxopt", "optimistix", "lineax", "pyvista"]
+    heavy += ["typer", "zarr", "dask"]
+    program = f"""
+import sys, jaxdeform as jd
+print(*[x for x in ("jax", "numpy") if x in sys.modules])
+jd.precompute, jd.deform
+print(*[x for x in {heavy} if x in sys.modules])
+"""
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from beartype import beartype
 
-INIT = Path(__file__).parents[1] / "jaxdeform" / "__init__.py"
+INIT = Path(__file__).parents[1] / "jaxdeform" / "__init__.pyi"
 PUBLIC = next(
     set(ast.literal_eval(node.value))
     for node in ast.parse(INIT.read_text()).body

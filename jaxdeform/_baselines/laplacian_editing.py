@@ -64,7 +64,7 @@ class LaplacianEditor(eqx.Module):
         """Return the edited positions, differentiable in the targets (handles, 3)."""
         check_precision("this editor", np.dtype(self.rest.dtype))
         targets = check_targets(targets, len(self.handles), np.dtype(self.rest.dtype))
-        if all(map(is_concrete, (targets, self.rest, self.handles))):
+        if is_concrete(targets, self.rest, self.handles):
             led = np.array(self.rest)
             led[np.asarray(self.handles)] = targets
         else:

@@ -107,7 +107,7 @@ def spread_targets(
     """
     system, handles = problem.system, problem.handles
     shape = *targets.shape[:-1], problem.bucket
-    if all(map(is_concrete, (targets, system.rest, handles))):
+    if is_concrete(targets, system.rest, handles):
         spread = np.array(np.broadcast_to(system.rest, shape))
         spread[..., np.asarray(handles)] = targets
         return spread
@@ -127,7 +127,7 @@ def read_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "v
         )
     given = jnp.broadcast_to(given, handles.shape)
     given = jnp.where(system.free[handles], given, 0.0)
-    if is_concrete(given) and is_concrete(system.soft):
+    if is_concrete(given, system.soft):
         most = np.asarray(system.soft)[np.asarray(handles)]
         bad = np.flatnonzero(~((np.asarray(given) >= 0) & (np.asarray(given) <= most)))
         if bad.size:

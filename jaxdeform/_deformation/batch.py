@@ -166,7 +166,7 @@ class _Batch(NamedTuple):
     def read(
         problem: Problem, targets: ArrayLike, rigidity: ArrayLike, start: ArrayLike | None
     ) -> "_Batch":
-        if not all(map(is_concrete, jax.tree.leaves(problem))):
+        if not is_concrete(problem):
             raise InputError(
                 "problem: traced by JAX (jit, vmap or grad), but a batch is computed at once: use "
                 "jax.vmap of jd.deform there"

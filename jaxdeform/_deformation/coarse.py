@@ -131,7 +131,7 @@ def coarsen(problem: Problem, n_vertices: int = 2000) -> CoarseProblem:
     check_problem(problem)
     n_vertices = check_count("n_vertices", n_vertices, least=4, most=2**31 - 1)
     mesh, system = problem.mesh, problem.system
-    if not all(map(is_concrete, jax.tree.leaves(problem))):
+    if not is_concrete(problem):
         raise InputError("problem is traced by JAX: call coarsen outside of jit")
     if n_vertices >= mesh.referenced.sum():
         raise InputError(

@@ -98,7 +98,7 @@ def deform_path(
     if progress is None:
         _, out = _follow(system, inputs, last, how)
     else:
-        if not all(map(is_concrete, jax.tree.leaves((system, inputs, last)))):
+        if not is_concrete(system, inputs, last):
             raise InputError(
                 "progress is told while the frames are computed, not while JAX traces (jit, vmap, "
                 "grad): leave it out there"

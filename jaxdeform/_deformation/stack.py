@@ -50,7 +50,7 @@ def stack_problems(problems: Sequence[Problem]) -> Problem:
         check_problem(problem)
     first = problems[0]
     for k, problem in enumerate(problems):
-        if not all(map(is_concrete, jax.tree.leaves(problem))):
+        if not is_concrete(problem):
             raise InputError(f"problem {k} is traced by JAX: stack problems outside of jit")
         if len(problem.handles) != len(first.handles):
             raise InputError(

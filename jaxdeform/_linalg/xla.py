@@ -84,8 +84,7 @@ def quick_jit(
 
 def _is_at_top(arguments: tuple) -> bool:
     """Whether JAX is not tracing: it takes compiler options nowhere else."""
-    leaves = [*jax.tree.leaves(arguments), jnp.zeros(())]  # the last is traced inside jit
-    return all(map(is_concrete, leaves))
+    return is_concrete(arguments, jnp.zeros(()))  # the last is traced inside jit
 
 
 @cache
