@@ -255,7 +255,7 @@ def read_arrays(path: Path) -> FileArrays:
             f"{path}: face {polygons.sizes.argmax()} has {largest} corners: cut it into triangles "
             "in a modeller; here that would take too long"
         )
-    source = Source(suffix, data, polygons, trailing, read_only(points))
+    source = Source(suffix, data, polygons, trailing, read_only(points), path.absolute())
     return FileArrays(points, triangles(points, polygons), source)
 
 

@@ -195,6 +195,20 @@ def all_keywords(data: bytes) -> list[bytes]:
     return _keyed_lines(data)[1]
 
 
+def material_of_faces(data: bytes) -> tuple[list[bytes], list[bytes]]:
+    """Return the libraries of materials, and the material of each face, or an empty name."""
+    libraries, used, now = [], [], b""
+    for line, keyword in zip(*_keyed_lines(data), strict=True):
+        name = line.split(None, 1)[1].strip() if len(line.split(None, 1)) > 1 else b""
+        if keyword == b"mtllib":
+            libraries.append(name)
+        elif keyword == b"usemtl":
+            now = name
+        elif keyword == b"f":
+            used.append(now)
+    return libraries, used
+
+
 def corner_texture(data: bytes, polygons: Polygons) -> Float[np.ndarray, "corners 2"] | None:
     """Return the texture coordinates of each corner; NaN where it names none."""
     lines, keywords = _keyed_lines(data)

@@ -1,6 +1,7 @@
 """What a reader of files returns, and what a mesh remembers of its file."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,8 @@ class Source:
     """The number of bytes behind the end of what the format describes."""
     points: Float[np.ndarray, "points 3"]
     """The positions in the file."""
+    path: Path
+    """Where it was, for the files that it names."""
 
     def fits(self, n_vertices: int, faces: Int[np.ndarray, "faces 3"]) -> bool:
         """Return whether a mesh is of this file: the polygons, cut in any way, at any positions."""

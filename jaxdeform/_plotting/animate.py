@@ -104,8 +104,8 @@ def animate(
     stage = Stage(surface, width, height, edges=edges)
     try:
         images = []
-        for pose, color, view, title in zip(arrays, paint.colors, views, titles, strict=True):
-            panel = stage.draw(pose, color, view, dots)
+        for pose, coat, view, title in zip(arrays, paint.coats, views, titles, strict=True):
+            panel = stage.draw(pose, coat, view, dots)
             # Every frame has room for the longest title, so that none jumps.
             images.append(sheet.arrange([panel], [title], 1, title_lines=lines))
     finally:

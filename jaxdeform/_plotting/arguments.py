@@ -16,7 +16,7 @@ from jaxdeform._mesh.selection import check_handles, read_mask
 from jaxdeform._plotting.camera import guess_up
 from jaxdeform._plotting.color import NEUTRAL, Scale, rgb, scale_of
 from jaxdeform._plotting.scene import Dots
-from jaxdeform._plotting.surface import Surface
+from jaxdeform._plotting.surface import Coat, Surface
 
 STRETCH = "stretch"
 
@@ -132,9 +132,9 @@ def _box(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 class Paint(NamedTuple):
-    """The colours of each pose, and what they mean."""
+    """How each pose is painted, and what the colours mean."""
 
-    colors: list[Float[np.ndarray, "vertices 3"]]
+    coats: list[Coat]
     scale: Scale | None
     label: str
 
@@ -149,8 +149,13 @@ def read_paint(
     scale = scale_of(shown_) or scale_of([v for v in numbers if v is not None])
     own = file_colors(surface.mesh.source)
     plain = np.tile(rgb(NEUTRAL), (surface.mesh.n_vertices, 1)) if own is None else own
-    colors = [plain if v is None or scale is None else scale.colors(v) for v in numbers]
-    return Paint(colors, scale, label or (STRETCH if isinstance(values, str) else "rigidity"))
+    coats = [
+        Coat(plain, textured=True)
+        if v is None or scale is None
+        else Coat(scale.colors(v), textured=False)
+        for v in numbers
+    ]
+    return Paint(coats, scale, label or (STRETCH if isinstance(values, str) else "rigidity"))
 
 
 def _read_values(surface: Surface, poses: Sequence[Pose], values: Any) -> list[np.ndarray | None]:

@@ -52,8 +52,8 @@ def render(
     """Draw poses of a mesh beside each other, with one camera, light and scale, into a PNG file.
 
     A pose that is not finite, or that reaches 5 times as far as the others, does not hide them: it
-    is cut off, and its title says so. Without values a mesh has the colours of its file, if the
-    file has any.
+    is cut off, and its title says so. Without values a mesh has the images or colours of its file,
+    if the file names or has any.
 
     **Arguments**
 
@@ -200,8 +200,8 @@ def _drawn(
     stage = Stage(surface, width, height, edges=look.edges)
     try:
         drawn = [
-            stage.draw(pose, color, view, dots)
-            for pose, color in zip(poses, paint.colors, strict=True)
+            stage.draw(pose, coat, view, dots)
+            for pose, coat in zip(poses, paint.coats, strict=True)
         ]
     finally:
         stage.close()

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxdeform._plotting.camera import View
-from jaxdeform._plotting.surface import Surface
+from jaxdeform._plotting.surface import Coat, Surface
 
 FIXED, MOVED = "#39424e", "#e0245e"
 
@@ -57,7 +57,7 @@ class Stage:
     def draw(
         self,
         pose: Float[np.ndarray, "vertices 3"],
-        colors: Float[np.ndarray, "vertices 3"],
+        coat: Coat,
         view: View,
         dots: Dots | None,
     ) -> UInt8[np.ndarray, "height width 3"]:
@@ -66,7 +66,7 @@ class Stage:
         plotter.clear_actors()
         # Single precision is enough near the origin and at size 1, whatever the mesh's unit.
         pose = within_reach((pose - view.focus) / view.depth)
-        self._add_surface(pose, colors)
+        self._add_surface(pose, coat)
         if dots is not None:
             self._add_dots(pose, dots)
         camera = plotter.camera
@@ -84,7 +84,7 @@ class Stage:
         blocks = image.reshape(h, self.finer, w, self.finer, 3)
         return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
-    def _add_surface(self, pose: np.ndarray, colors: np.ndarray) -> None:
+    def _add_surface(self, pose: np.ndarray, coat: Coat) -> None:
         import pyvista
 
         surface = self.surface
@@ -93,13 +93,25 @@ class Stage:
         if not whole.any():
             return
         points = np.where(finite[:, None], pose, 0.0)[surface.index]
-        drawn = pyvista.PolyData.from_regular_faces(points, surface.faces[whole])
-        drawn.point_data["colors"] = np.rint(255 * colors[surface.index]).astype(np.uint8)
-        drawn.point_data.active_normals = surface.normals(pose).astype(np.float32)
+        normals = surface.normals(pose)
+        for image, chosen, places in surface.textures if coat.textured else ():
+            seen = chosen & whole
+            at = surface.faces[seen].ravel()
+            # Points of their own for each corner, which has its own place in the image.
+            drawn = _polygons(points[at], np.arange(at.size).reshape(-1, 3), normals[at])
+            if drawn is not None:
+                drawn.active_texture_coordinates = places[seen].reshape(-1, 2)
+                self._add(drawn, color="white", texture=pyvista.Texture(image))
+            whole &= ~chosen
+        drawn = _polygons(points, surface.faces[whole], normals)
+        if drawn is not None:
+            colors = np.rint(255 * coat.colors[surface.index]).astype(np.uint8)
+            drawn.point_data["colors"] = colors
+            self._add(drawn, scalars="colors", rgb=True)
+
+    def _add(self, drawn: Any, **look: Any) -> None:
         actor = self.plotter.add_mesh(
             drawn,
-            scalars="colors",
-            rgb=True,
             reset_camera=False,
             show_edges=self.edges,
             edge_color="#2b333d",
@@ -109,6 +121,7 @@ class Stage:
             diffuse=0.78,
             specular=0.10,
             specular_power=12,
+            **look,
         )
         actor.prop.interpolation = "Phong"
 
@@ -127,6 +140,17 @@ class Stage:
                     ambient=0.45,
                     diffuse=0.65,
                 )
+
+
+def _polygons(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Any:
+    """Return triangles that VTK can draw, or None for none."""
+    import pyvista
+
+    if not len(faces):
+        return None
+    drawn = pyvista.PolyData.from_regular_faces(points, faces)
+    drawn.point_data.active_normals = normals.astype(np.float32)
+    return drawn
 
 
 def within_reach(pose: np.ndarray) -> np.ndarray:

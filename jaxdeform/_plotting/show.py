@@ -22,6 +22,7 @@ from jaxdeform._plotting.render import framing, panel_height, shown_handles
 from jaxdeform._plotting.scene import FIXED, MOVED, Dots, Stage, within_reach
 from jaxdeform._plotting.sheet import Legend, Sheet
 from jaxdeform._plotting.surface import Surface
+from jaxdeform._plotting.texture import seen_at_vertices
 
 # Half of what the eye takes in from top to bottom. A small angle looks like the parallel pictures.
 _HALF_ANGLE = 10.0
@@ -92,7 +93,8 @@ def show(
 
     A notebook that is not trusted shows a picture instead. Several poses are played there and back
     again, the vertices moving along straight lines from one to the next; the picture has the first.
-    For a file to look at elsewhere: ``show(...).save("m.html")``.
+    An image on the surface is shown by the colours that it has at the vertices. For a file to look
+    at elsewhere: ``show(...).save("m.html")``.
 
     **Arguments**
 
@@ -130,7 +132,7 @@ def show(
     height, dots = panel_height(width, view), look.dots(arrays)
     stage = Stage(surface, width, height, edges=False)
     try:
-        panel = stage.draw(arrays[0], paint.colors[0], view, dots)
+        panel = stage.draw(arrays[0], paint.coats[0], view, dots)
     finally:
         stage.close()
     sheet = Sheet(width, height, Legend(paint.scale, paint.label, shown_handles(dots)))
@@ -142,6 +144,12 @@ def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) 
     """Return a page that shows the poses, one a second."""
     import k3d  # slow to import, and needed only here
 
+    coats = [
+        seen_at_vertices(surface.mesh, surface.textures, coat.colors)
+        if coat.textured
+        else coat.colors
+        for coat in paint.coats
+    ]
     near = [within_reach((pose - view.focus) / view.depth) for pose in poses]
     plot: Any = k3d.factory.plot(
         grid_visible=False,
@@ -158,7 +166,7 @@ def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) 
         _over_time([pose[surface.index] for pose in near]),
         surface.faces.astype(np.uint32),
         normals=_over_time([surface.normals(pose) for pose in near]),
-        colors=_over_time([_packed(colors[surface.index]) for colors in paint.colors], np.uint32),
+        colors=_over_time([_packed(coat[surface.index]) for coat in coats], np.uint32),
         flat_shading=False,
         side="double",
     )

@@ -1,15 +1,25 @@
 """Meshes as they are drawn: sharp edges stay sharp, the rest is shaded smoothly."""
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxdeform._mesh.mesh import Mesh, connected_components
 from jaxdeform._mesh.polygons import area_vectors, from_triangles, triangle_area_vectors, unit
+from jaxdeform._plotting.texture import Texture, textures_of
 
 # The rest shape has an edge to see where two faces meet at more than this angle.
 _SHARP = np.cos(np.radians(40.0))
+
+
+class Coat(NamedTuple):
+    """How a pose is painted."""
+
+    colors: Float[np.ndarray, "vertices 3"]
+    textured: bool
+    """Whether the images of the mesh are over the colours."""
 
 
 class Surface:
@@ -32,6 +42,11 @@ class Surface:
         """The vertex of each point."""
         self.faces = new.reshape(-1, 3)
         """The points of each face."""
+
+    @cached_property
+    def textures(self) -> list[Texture]:
+        """The images on the mesh."""
+        return textures_of(self.mesh)
 
     def normals(self, pose: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "points 3"]:
         """Return the direction of the surface at each point, weighted by area."""
