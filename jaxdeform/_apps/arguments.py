@@ -9,9 +9,9 @@ import numpy as np
 import jaxdeform as jd
 from jaxdeform._checks import check_rigidity
 from jaxdeform._errors import shown
-from jaxdeform._estimation.parts import check_parts
 from jaxdeform._mesh.reading import read_json, read_text
 from jaxdeform._mesh.select import some_where
+from jaxdeform._mesh.selection import check_parts
 from jaxdeform._mesh.words import real
 
 MEDIUM = 0.2

@@ -18,7 +18,7 @@ from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import (
     Solution,
     cut_to_mesh,
-    guess,
+    first_guess,
     solution_of,
     without_derivative,
 )
@@ -117,7 +117,7 @@ def _solve(
     energy = energy._replace(system=without_derivative(energy.system))
     system, targets = energy.system, inputs.targets
     if start is None:
-        start = system.rest + guess(system, targets - system.rest)
+        start = first_guess(system, targets)
     start = jnp.where(system.free[None], start, targets)
     if steps is None:
         known = jax.lax.stop_gradient((energy, start))

@@ -165,6 +165,8 @@ def deform(
                 "rest and edge_weights are differentiated by Implicit() only: give "
                 "adjoint=jd.Implicit()"
             )
+    if start is None:  # a program of its own, so that a start given later compiles nothing anew
+        start = _first_guess(problem.system, inputs.targets)
     out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, how), problem.n_vertices)
     return check_result(out, throw)
 
@@ -226,11 +228,20 @@ def solve(
     """Deform once; without a start, from Laplacian editing."""
     system = without_derivative(system)
     if start is None:
-        start = system.rest + guess(system, inputs.targets - system.rest)
+        start = first_guess(system, inputs.targets)
     return descend(system, inputs, jnp.asarray(start), how)[0]
 
 
 _solve_at_once = quick_jit(static=("how",), options=AS_FAST)(solve)
+
+
+def first_guess(system: System, targets: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+    """Return where Laplacian editing puts the vertices."""
+    system = without_derivative(system)
+    return system.rest + guess(system, targets - system.rest)
+
+
+_first_guess = quick_jit(static=())(first_guess)
 
 
 def guess(system: System, displacement: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:

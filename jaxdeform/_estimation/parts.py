@@ -6,25 +6,25 @@ positive and makes 'ten times stiffer' the same step everywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jaxdeform._checks import (
     check_count,
     check_flag,
     check_function,
-    check_labels,
     check_tolerance,
 )
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike
 from jaxdeform._estimation.bounded_gauss_newton import box_solver
-from jaxdeform._estimation.discrepancy import LEVEL, Discrepancy, describe, f_test
+from jaxdeform._estimation.discrepancy import LEVEL, describe, f_test
+from jaxdeform._estimation.estimate import Estimate
 from jaxdeform._estimation.intervals import extremes, has_settled, linear_spread, log_intervals
 from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
 from jaxdeform._estimation.outliers import find_outliers
@@ -32,100 +32,13 @@ from jaxdeform._estimation.part_model import Fit, PartModel
 from jaxdeform._estimation.poses import check_poses, same_length, without
 from jaxdeform._estimation.search import search
 from jaxdeform._estimation.smooth_modes import smooth_modes
-from jaxdeform._estimation.verdict import Verdict, in_words
-from jaxdeform._mesh.mesh import Mesh
-from jaxdeform._mesh.selection import read_mask_or_numbers
+from jaxdeform._estimation.verdict import Verdict
+from jaxdeform._mesh.selection import check_parts
 from jaxdeform._result import Result, check_result, succeeded
 
 # Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
 # diagonal, which is ten times what solvers leave at their default tolerance.
 _OUTLIER_ROUNDS, _MISPLACED = 3, 1e-4
-# A vertex that moves less than this fraction of the diagonal does not move visibly.
-_VISIBLE = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Rigidity as observed poses tell it, with what they do not tell.
-
-    **Fields**
-
-    - rigidity: (parts,) best value of each part; its unit is length squared.
-    - material: (parts,) the same as a scale-free constant (`rigidity_from_material`).
-    - interval: (parts, 2) 95 % interval of the rigidity of each part. It starts at 0 where the part
-      may be arbitrarily soft, and ends at infinity where it may be arbitrarily stiff.
-    - verdict: a `Verdict` of each part, which follows from its interval.
-    - displacement: (parts, 2) how far a compared vertex moves at most (a length) if the part
-      becomes perfectly soft, or perfectly stiff. Where that is too little to see, the value hardly
-      matters, however well it is known.
-    - discrepancy: what the model leaves unexplained, a `Discrepancy`.
-    - field: (vertices,) the rigidity of each vertex, as `deform` takes it.
-    - vertices: (poses, vertices, 3) the fitted poses.
-    - misfit: root mean square of the differences between fitted and observed coordinates (a
-      length).
-    - diagonal: of the bounding box of the rest shape; relative_misfit: misfit / diagonal.
-    - solver_error: root mean square distance of the solver's end from the minimum (a length). The
-      intervals allow for as much in the observed poses; a smaller misfit says nothing.
-    - outliers: (poses, vertices) True where a vertex was left out, because it was seen far from
-      where its neighbors say.
-    - history: (evaluations,) misfit of each evaluation, accepted or not.
-    - result: how the search ended, a member of `Result`.
-    """
-
-    rigidity: Float[np.ndarray, "parts"]
-    material: Float[np.ndarray, "parts"]
-    interval: Float[np.ndarray, "parts 2"]
-    verdict: tuple[Verdict, ...]
-    displacement: Float[np.ndarray, "parts 2"]
-    discrepancy: Discrepancy
-    field: Float[np.ndarray, "vertices"]
-    vertices: Float[np.ndarray, "poses vertices 3"]
-    misfit: float
-    diagonal: float
-    solver_error: float
-    outliers: Bool[np.ndarray, "poses vertices"]
-    history: Float[np.ndarray, "evaluations"]
-    result: Result
-
-    @property
-    def ok(self) -> bool:
-        """True if the search converged and the model explains the poses."""
-        return bool(succeeded(self.result))
-
-    @property
-    def relative_misfit(self) -> float:
-        """The misfit as a fraction of the diagonal."""
-        return self.misfit / self.diagonal
-
-    def explain(self) -> str:
-        """Return everything in words, a line for each part and each fact."""
-        lines = [self._explain_part(k) for k in range(len(self.rigidity))]
-        lines.append(
-            f"misfit {self.misfit:.3g}, {100 * self.relative_misfit:.2g} % of the diagonal "
-            f"({len(self.history)} evaluations)"
-        )
-        if self.misfit <= self.solver_error:
-            lines.append(
-                f"the misfit is below the error of the solver ({self.solver_error:.2g}): the poses "
-                "are explained as well as its tolerance allows"
-            )
-        if self.outliers.any():
-            at = np.argwhere(self.outliers)
-            shown = ", ".join(f"{vertex} (pose {pose})" for pose, vertex in at[:3])
-            lines.append(f"left out as seen in a wrong place: vertices {shown} ({len(at)} in all)")
-        if self.discrepancy.found:
-            lines.append(self.discrepancy.explain())
-        return "\n".join([*lines, Result[self.result]])
-
-    def _explain_part(self, k: int) -> str:
-        text = f"part {k}: {in_words(self.verdict[k], self.rigidity[k], self.interval[k])}"
-        if self.verdict[k] is Verdict.determined:
-            text += f", material {self.material[k]:.3g}"
-        hidden = self.displacement[k] < _VISIBLE * self.diagonal
-        kinds = [kind for kind, unseen in zip(("softer", "stiffer"), hidden, strict=True) if unseen]
-        if kinds:
-            text += f"; {' or '.join(kinds)} makes no visible difference"
-        return text
 
 
 def estimate_rigidity(
@@ -327,17 +240,3 @@ def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
         history=np.array(found.history),
         result=result,
     )
-
-
-def check_parts(parts: ArrayLike, mesh: Mesh) -> Int[np.ndarray, "vertices"]:
-    """Return the part of each vertex, or raise InputError naming what is wrong."""
-    given, n = read_mask_or_numbers("parts", parts, mesh), mesh.n_vertices
-    label = given.astype(int) if given.dtype == bool else given
-    label = check_labels("parts", label, n, "vertex", n)
-    missing = np.setdiff1d(np.arange(label.max() + 1), label)
-    if missing.size:
-        raise InputError(
-            f"no vertex belongs to part {missing[0]}, though parts go up to {label.max()}: number "
-            "them without gaps, as np.unique(parts, return_inverse=True)[1] does"
-        )
-    return label.astype(np.int32)

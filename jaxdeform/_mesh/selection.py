@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxdeform._arrays import read_integers, read_numbers, read_only
-from jaxdeform._checks import check_index, check_type
+from jaxdeform._checks import check_index, check_labels, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
 
@@ -210,3 +210,17 @@ def ranges(mesh: Mesh) -> str:
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     x, y, z = (f"from {a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
     return f"x runs {x}, y {y}, z {z}"
+
+
+def check_parts(parts: ArrayLike, mesh: Mesh) -> Int[np.ndarray, "vertices"]:
+    """Return the part of each vertex, or raise InputError naming what is wrong."""
+    given, n = read_mask_or_numbers("parts", parts, mesh), mesh.n_vertices
+    label = given.astype(int) if given.dtype == bool else given
+    label = check_labels("parts", label, n, "vertex", n)
+    missing = np.setdiff1d(np.arange(label.max() + 1), label)
+    if missing.size:
+        raise InputError(
+            f"no vertex belongs to part {missing[0]}, though parts go up to {label.max()}: number "
+            "them without gaps, as np.unique(parts, return_inverse=True)[1] does"
+        )
+    return label.astype(np.int32)

@@ -84,6 +84,7 @@ def test_right_models_are_not_accused(bar, bar_problem, bar_targets, pose):
     [
         (lambda pose: 1000.0 * pose, "997 times as long as at rest"),
         (lambda pose: 0.001 * pose, "times as long as at rest"),
+        (lambda pose: 0.0 * pose, "as long as at rest"),
         (lambda pose: pose * [1.0, 1.0, -1.0], "mirror image"),
         (lambda pose: np.random.default_rng(0).permutation(pose), "as long as at rest"),
     ],

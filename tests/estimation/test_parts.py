@@ -5,8 +5,8 @@ import pytest
 from helpers import THESIS, noisy
 
 import jaxdeform as jd
-from jaxdeform._estimation.parts import check_parts
 from jaxdeform._estimation.poses import check_poses
+from jaxdeform._mesh.selection import check_parts
 
 # ---------------------------------------------------------------- recovery
 

@@ -212,6 +212,9 @@ def test_a_byte_order_mark_does_no_harm(tmp_path, bar):
     path = tmp_path / "handles.JSON"
     path.write_text(json.dumps({"handles": [GOOD]}), encoding="utf-8-sig")
     assert jd.load_handles(path, bar).handles.tolist() == [0, 1]
+    path = tmp_path / "arm.tgf"
+    path.write_text("1 0 0 0\n2 0 1 0\n#\n1 2\n", encoding="utf-8-sig")
+    np.testing.assert_array_equal(jd.load_skeleton(path).joints, [[0, 0, 0], [0, 1, 0]])
 
 
 MATRIX = "# moves\n1 0 0 10\n0 0 -1 0\n\n0 1 0 -5\n0 0 0 1\n"
