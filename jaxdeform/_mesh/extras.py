@@ -31,7 +31,7 @@ _PLY_KNOWN = {
 
 def file_extras(source: Source | None) -> Extras:
     """Return what the file has of them."""
-    return Extras(file_colors(source), _file_texture(source)) if source else Extras()
+    return Extras(file_colors(source), file_texture(source)) if source else Extras()
 
 
 def file_colors(source: Source | None) -> Float[np.ndarray, "vertices 3"] | None:
@@ -89,7 +89,8 @@ def _numbers(words: list[list[bytes]]) -> np.ndarray | None:
         return None
 
 
-def _file_texture(source: Source) -> Float[np.ndarray, "corners 2"] | None:
+def file_texture(source: Source) -> Float[np.ndarray, "corners 2"] | None:
+    """Return the texture coordinates of each corner of each polygon, if the file has them."""
     read = {".ply": ply_texture, ".obj": obj_texture}.get(source.suffix)
     found = read(without_mark(source.data), source.polygons) if read else None
     return None if found is None or np.isnan(found).all() else found

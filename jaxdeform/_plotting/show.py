@@ -143,6 +143,7 @@ def show(
 def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) -> str:
     """Return a page that shows the poses, one a second."""
     import k3d  # slow to import, and needed only here
+    from ipywidgets import Widget  # comes with k3d
 
     coats = [
         seen_at_vertices(surface.mesh, surface.textures, coat.colors)
@@ -180,7 +181,10 @@ def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) 
             )
     away = max(view.half_height, view.half_width) / view.depth / np.tan(np.radians(_HALF_ANGLE))
     plot.camera = [*(away * view.toward), 0.0, 0.0, 0.0, *view.above]
-    return plot.get_snapshot()
+    page = plot.get_snapshot()
+    for widget in (*plot.objects, plot.layout, plot):  # else their arrays stay in the process
+        Widget.close(widget)
+    return page
 
 
 def _over_time(arrays: list, dtype: Any = np.float32) -> Any:

@@ -1,15 +1,18 @@
 """The images on a mesh, read from the files that its own file names."""
 
 import warnings
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxdeform._mesh.extras import file_extras
+from jaxdeform._errors import InputError, printable
+from jaxdeform._mesh.extras import file_texture
 from jaxdeform._mesh.images import images_of
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.reading import read_bytes
 
 # A panel is rarely as wide.
 _LARGEST = 4096
@@ -27,7 +30,8 @@ class Texture(NamedTuple):
 def textures_of(mesh: Mesh) -> list[Texture]:
     """Return the images of a mesh. One that cannot be read is left out, with a warning."""
     source = mesh.source
-    at_corners = file_extras(source).texture
+    painted = images_of(source) if source is not None else []
+    at_corners = file_texture(source) if source is not None and painted else None
     if source is None or at_corners is None:
         return []
     sizes, corners = source.polygons
@@ -37,7 +41,7 @@ def textures_of(mesh: Mesh) -> list[Texture]:
     places = at_corners[order[np.searchsorted(codes[order], polygon[:, None] + mesh.faces)]]
     placed = np.isfinite(places).all(axis=(1, 2))
     out = []
-    for path, polygons in images_of(source):
+    for path, polygons in painted:
         image, faces = _image(path), np.repeat(polygons, sizes - 2) & placed
         if image is not None and faces.any():
             out.append(Texture(image, faces, places))
@@ -66,11 +70,14 @@ def _image(path: Path) -> UInt8[np.ndarray, "height width 3"] | None:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # of Pillow, about images too large for the memory
-            with Image.open(path) as image:
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(BytesIO(read_bytes(path))) as image:
                 image.thumbnail((_LARGEST, _LARGEST))
                 return np.asarray(image.convert("RGB"))
+    except InputError as error:
+        reason = str(error)
     except Exception as error:  # whatever Pillow raises for a broken file
-        reason = "is not there" if isinstance(error, FileNotFoundError) else f"{error}"
-        warnings.warn(f"{path}: {reason}: drawn without this image", stacklevel=2)
-        return None
+        reason = f"{printable(str(path))}: {error}"
+    warnings.warn(f"{reason}: drawn without this image", stacklevel=2)
+    return None

@@ -61,6 +61,14 @@ def test_the_page_needs_nothing_from_elsewhere(bar):
     assert not re.findall(r"""(?:src|href)\s*=\s*["']?\s*(?:https?:)?//""", page)
 
 
+def test_nothing_is_left_in_the_process(bar):
+    """Widgets register themselves, with their arrays, until they are closed."""
+    from ipywidgets.widgets.widget import _instances
+
+    jd.show(bar, [bar.vertices], handles=[0])
+    assert {type(widget).__name__ for widget in _instances.values()} <= {"Layout"}
+
+
 class _Parts(HTMLParser):
     """The pictures and the frames of a piece of HTML."""
 

@@ -3,6 +3,7 @@
 import gzip
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -123,9 +124,73 @@ def test_a_broken_image_is_named_and_left_out(folder, fault):
         assert not seen(jd.load_mesh(folder / "square.obj"), folder / "out.png")
 
 
-def test_names_that_lead_nowhere(folder):
-    """No library, an empty name, a folder, a library in a far place: no image, and no error."""
-    for library in ("nowhere.mtl", "", ".", "/", "\0"):
-        text = SQUARE.format(library=library, material="painted  wood")
-        (folder / "odd.obj").write_text(text)
+@pytest.mark.parametrize("name", ["nowhere.mtl", "", ".", "/", "\0", "x" * 300, "/proc/self/x"])
+def test_names_that_lead_nowhere(folder, name):
+    (folder / "odd.obj").write_text(SQUARE.format(library=name, material="painted  wood"))
+    assert images_of(jd.load_mesh(folder / "odd.obj").source) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="of Linux")
+@pytest.mark.parametrize("place", ["/proc/self/mem", "/proc/kmsg"])
+def test_files_that_the_system_makes_are_not_read(folder, place):
+    (folder / "odd.obj").write_text(SQUARE.format(library=place, material="painted  wood"))
+    with pytest.warns(UserWarning, match="drawn without its images"):
         assert images_of(jd.load_mesh(folder / "odd.obj").source) == []
+    (folder / "my colours.mtl").write_text(f"newmtl painted  wood\nmap_Kd {place}\n")
+    with pytest.warns(UserWarning, match="drawn without this image"):
+        assert textures_of(jd.load_mesh(folder / "square.obj")) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "map_Kd maps/four quarters.png # as painted",
+        "map_kd\tmaps\\four quarters.png",
+        "map_Kd -s 1.0e+00 1.0e-00 1 maps/four quarters.png",
+        "map_Kd -mm 0 +1 -type sphere -colorspace sRGB -imfchan l maps/four quarters.png",
+        "map_Kd C:\\somewhere\\else\\maps\\..\\four quarters.png",
+        'map_Kd "maps/four quarters.png"',
+    ],
+)
+def test_lines_that_programs_write(folder, line):
+    image = folder / "maps" / "four quarters.png"
+    (folder / "four quarters.png").write_bytes(image.read_bytes())
+    text = f"map_Kd of nobody.png\nnewmtl\tpainted  wood\n{line}\n"
+    (folder / "my colours.mtl").write_text(text, encoding="utf-8-sig")
+    (texture,) = textures_of(jd.load_mesh(folder / "square.obj"))
+    np.testing.assert_array_equal(texture.faces, [True, True, False, False])
+
+
+def test_several_libraries_comments_and_one_image_of_two_materials(folder):
+    """An image is read once, however many materials have it."""
+    image = "map_Kd maps/four quarters.png\n"
+    (folder / "a.mtl").write_text(f"newmtl painted\n{image}")
+    (folder / "b.mtl").write_text(f"newmtl plain\n{image}")
+    text = SQUARE.format(library="a.mtl b.mtl # both", material="painted # wood")
+    (folder / "both.obj").write_text(text)
+    (texture,) = textures_of(jd.load_mesh(folder / "both.obj"))
+    assert texture.faces.all()
+
+
+def test_a_palette_with_transparency_is_an_image(folder):
+    place = folder / "maps" / "four quarters.png"
+    with Image.open(place) as image:
+        image.convert("RGBA").quantize(16).save(place)
+    assert len(textures_of(jd.load_mesh(folder / "square.obj"))) == 1
+
+
+def test_a_ply_with_other_line_ends_or_two_images(folder):
+    mesh = jd.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    lines = [
+        *("ply", "format ascii 1.0", "comment TextureFile maps/four quarters.png"),
+        *("element vertex 3", *(f"property float {x}" for x in "xyzst")),
+        *("element face 1", "property list uchar int vertex_indices", "end_header"),
+        *(f"{x} {y} {z} {x} {y}" for x, y, z in mesh.vertices),
+        "3 0 1 2\r",
+    ]
+    (folder / "cr.ply").write_bytes("\r".join(lines).encode())
+    assert len(textures_of(jd.load_mesh(folder / "cr.ply"))) == 1
+    lines.insert(2, "comment TextureFile other.png")
+    (folder / "two.ply").write_bytes("\n".join(lines).encode())
+    with pytest.warns(UserWarning, match="names 2 images"):
+        assert textures_of(jd.load_mesh(folder / "two.ply")) == []
