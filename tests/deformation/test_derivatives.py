@@ -14,7 +14,7 @@ import jaxdeform as jd
     [
         (jd.Alternating(30), jd.Unrolled()),
         pytest.param(jd.Alternating(2000), jd.Implicit(), marks=pytest.mark.slow),
-        (jd.QuasiNewton(tolerance=1e-15), jd.Implicit()),
+        pytest.param(jd.QuasiNewton(tolerance=1e-15), jd.Implicit(), marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_by_differences(bar_problem, bar_targets, solver, adjoint):

@@ -12,7 +12,7 @@ from jaxdeform._mesh.selection import check_parts
 
 
 @pytest.mark.parametrize(
-    "true", [*(pytest.param(x, marks=pytest.mark.slow) for x in (0.05, 1.0)), 30.0]
+    "true", [*(pytest.param(x, marks=pytest.mark.slow) for x in (0.05, 30.0)), 1.0]
 )
 def test_one_rigidity_is_recovered_from_a_soft_start(
     bar, bar_problem, bar_targets, equilibrium_of, true
