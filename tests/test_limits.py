@@ -82,13 +82,16 @@ def test_rubber_beside_steel(bar, handles, bar_targets, unit, dtype):
     assert bool(deformed(bar.vertices, bar.faces, handles, bar_targets, mixed, dtype).ok)
 
 
-def both(vertices, faces, handles, targets, rigidity) -> jd.Solution:
-    """Deform in both precisions, to the same energy, or float32 tells of a saddle."""
+def both(vertices, faces, handles, targets, rigidity, may_stop=False) -> jd.Solution:
+    """Deform in both precisions, which converge to the same energy.
+
+    Or, if it may stop, float32 tells of a saddle: of three orders of mixed targets one ends there
+    on processors without FMA, 2.5e-4 higher.
+    """
     out, single = (deformed(vertices, faces, handles, targets, rigidity, dtype) for dtype in TYPES)
     assert bool(out.ok)
-    # Of three orders of mixed targets one stops there on processors without FMA, 2.5e-4 higher.
-    at_saddle = single.result == jd.Result.saddle
-    assert bool(single.ok | at_saddle)
+    at_saddle = may_stop and bool(single.result == jd.Result.saddle)
+    assert at_saddle or bool(single.ok)
     np.testing.assert_allclose(single.energy[-1], out.energy[-1], rtol=1e-3 if at_saddle else 1e-4)
     assert int(single.flipped) == int(out.flipped)
     return out
@@ -113,7 +116,7 @@ def test_targets_that_no_shape_can_like(bar, handles, bar_targets, unit, where, 
         "100 diagonals away": bar_targets * 100.0,
         "mixed": np.random.default_rng(0).permutation(bar_targets),
     }[where]
-    out = both(bar.vertices, bar.faces, handles, at, unit)
+    out = both(bar.vertices, bar.faces, handles, at, unit, may_stop=where == "mixed")
     np.testing.assert_allclose(np.asarray(out.vertices)[handles], at, atol=1e-9 * bar.diagonal)
     assert (int(out.flipped) > 0) == inside_out
 

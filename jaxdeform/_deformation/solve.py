@@ -166,7 +166,7 @@ def deform(
                 "adjoint=jd.Implicit()"
             )
     if start is None:  # a program of its own, so that a start given later compiles nothing anew
-        start = _first_guess(problem.system, inputs.targets)
+        start = _guess_at_once(problem.system, inputs.targets)
     out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, how), problem.n_vertices)
     return check_result(out, throw)
 
@@ -237,11 +237,14 @@ _solve_at_once = quick_jit(static=("how",), options=AS_FAST)(solve)
 
 def first_guess(system: System, targets: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
     """Return where Laplacian editing puts the vertices."""
-    system = without_derivative(system)
     return system.rest + guess(system, targets - system.rest)
 
 
-_first_guess = quick_jit(static=())(first_guess)
+@quick_jit(static=())
+def _guess_at_once(
+    system: System, targets: Float[Array, "3 vertices"]
+) -> Float[Array, "3 vertices"]:
+    return first_guess(without_derivative(system), targets)
 
 
 def guess(system: System, displacement: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:

@@ -56,6 +56,8 @@ def _images_of_ply(source: Source, data: bytes) -> list[Painted]:
 
 
 def _images_of_obj(source: Source, data: bytes) -> list[Painted]:
+    if b"mtllib" not in data.lower():  # its lines need not be taken apart
+        return []
     libraries, used = material_of_faces(data)
     of_material: dict[bytes, Path] = {}
     for names in libraries:

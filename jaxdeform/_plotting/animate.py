@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,11 @@ from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_count, check_tolerance, read_path
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._mesh.mesh import Mesh
-from jaxdeform._plotting.arguments import find_faults, read_look, read_paint, read_poses, read_value
-from jaxdeform._plotting.camera import find_view
+from jaxdeform._plotting.arguments import read_look, read_poses, read_value
 from jaxdeform._plotting.files import check_picture_path, write_film
-from jaxdeform._plotting.render import framing, panel_height, shown_handles
+from jaxdeform._plotting.render import panel_height, set_up, sheet_of
 from jaxdeform._plotting.scene import Stage
-from jaxdeform._plotting.sheet import Legend, Sheet, Text
-from jaxdeform._plotting.surface import Surface
+from jaxdeform._plotting.sheet import Text
 
 # All frames are in memory together.
 _MOST_FRAMES, _MOST_PIXELS = 240, 200e6
@@ -87,29 +86,21 @@ def animate(
         chosen = np.linspace(0, len(arrays) - 1, _MOST_FRAMES).round().astype(int)
         arrays = [arrays[k] for k in chosen]
         values = values if isinstance(values, str) else [values[k] for k in chosen]
-    surface = Surface(mesh)
-    faults = find_faults(mesh, arrays)
-    paint = read_paint(surface, arrays, faults, values, label)
-    most = (_MOST_PIXELS / 1.5 / len(arrays)) ** 0.5
-    check_count("width", width, least=16, most=int(most))
     # A film of a whole turn does not show the first view again at its end.
     turns = np.radians(degrees) * np.arange(len(arrays)) / len(arrays)
-    framed = framing(mesh, arrays, faults)
-    views = find_view(framed, look.up, turns)
+    surface, faults, paint, views, dots = set_up(look, arrays, values, label, turns)
+    most = (_MOST_PIXELS / 1.5 / len(arrays)) ** 0.5
+    check_count("width", width, least=16, most=int(most))
     height = panel_height(width, views[0])
-    dots = look.dots([pose for pose, fault in zip(arrays, faults, strict=True) if fault.frames])
-    sheet = Sheet(width, height, Legend(paint.scale, paint.label, shown_handles(dots)))
+    sheet = sheet_of(width, height, paint, dots)
     titles = [[Text(fault.words, warns=True)] * bool(fault.words) for fault in faults]
     lines = max(len(sheet.wrapped(title)) for title in titles)
-    stage = Stage(surface, width, height, edges=edges)
-    try:
+    with closing(Stage(surface, width, height, edges=edges)) as stage:
         images = []
         for pose, coat, view, title in zip(arrays, paint.coats, views, titles, strict=True):
             panel = stage.draw(pose, coat, view, dots)
             # Every frame has room for the longest title, so that none jumps.
             images.append(sheet.arrange([panel], [title], 1, title_lines=lines))
-    finally:
-        stage.close()
     # What the format can say, in milliseconds.
     write_film(path, images, int(np.clip(1000 * seconds / len(images), 20, 600_000)))
 

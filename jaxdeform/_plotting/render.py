@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._plotting.arguments import (
     Fault,
     Look,
+    Paint,
     Pose,
     find_faults,
     listed,
@@ -188,33 +190,49 @@ def _drawn(
     look: Look, poses: list[Pose], grid: _Grid, values: Any, label: Any, width: Any
 ) -> Picture:
     """Return the picture of all poses."""
-    surface = Surface(look.mesh)
-    faults = find_faults(look.mesh, poses)
-    paint = read_paint(surface, poses, faults, values, label)
+    surface, faults, paint, (view,), dots = set_up(look, poses, values, label)
     panels = -(-len(poses) // grid.columns) * grid.columns
     most = min((_MOST_PIXELS / TALLEST / panels) ** 0.5, _MOST_WIDTH / grid.columns)
     check_count("width", width, least=16, most=int(most))
-    (view,) = find_view(framing(look.mesh, poses, faults), look.up, np.zeros(1))
     height = panel_height(width, view)
-    dots = look.dots([pose for pose, fault in zip(poses, faults, strict=True) if fault.frames])
-    stage = Stage(surface, width, height, edges=look.edges)
-    try:
+    with closing(Stage(surface, width, height, edges=look.edges)) as stage:
         drawn = [
             stage.draw(pose, coat, view, dots)
             for pose, coat in zip(poses, paint.coats, strict=True)
         ]
-    finally:
-        stage.close()
     titles = [
         [Text(words) for words in grid.titles[k : k + 1]]
         + [Text(fault.words, warns=True)] * bool(fault.words)
         for k, fault in enumerate(faults)
     ]
-    sheet = Sheet(width, height, Legend(paint.scale, paint.label, shown_handles(dots)))
+    sheet = sheet_of(width, height, paint, dots)
     return sheet.arrange(drawn, titles, grid.columns, grid.row_labels, grid.column_labels)
 
 
-def framing(mesh: Mesh, poses: list[Pose], faults: list[Fault]) -> list[np.ndarray]:
+class Setting(NamedTuple):
+    """What is drawn, and from where."""
+
+    surface: Surface
+    faults: list[Fault]
+    paint: Paint
+    views: list[View]
+    dots: Dots | None
+
+
+def set_up(
+    look: Look, poses: list[Pose], values: Any, label: Any, turns: np.ndarray | None = None
+) -> Setting:
+    """Read what the poses are painted with, and find views that show them, one for each turn."""
+    surface = Surface(look.mesh)
+    faults = find_faults(look.mesh, poses)
+    paint = read_paint(surface, poses, faults, values, label)
+    framed = _framing(look.mesh, poses, faults)
+    views = find_view(framed, look.up, np.zeros(1) if turns is None else turns)
+    dots = look.dots([pose for pose, fault in zip(poses, faults, strict=True) if fault.frames])
+    return Setting(surface, faults, paint, views, dots)
+
+
+def _framing(mesh: Mesh, poses: list[Pose], faults: list[Fault]) -> list[np.ndarray]:
     """Return the poses that the picture is made large enough for; without one, the rest shape."""
     framed = [
         pose[np.isfinite(pose).all(axis=1)] if fault.words else pose
@@ -230,8 +248,9 @@ def panel_height(width: int, view: View) -> int:
     return max(8, round(width * float(ratio)))
 
 
-def shown_handles(dots: Dots | None) -> tuple[str, ...]:
-    """Return which kinds of handles there are."""
-    if dots is None:
-        return ()
-    return tuple(name for k, name in enumerate(("fixed", "moved")) if (dots.moved == bool(k)).any())
+def sheet_of(width: int, height: int, paint: Paint, dots: Dots | None) -> Sheet:
+    """Return a sheet for panels of this size, with the legend of what is on them."""
+    moved = np.zeros(0, bool) if dots is None else dots.moved
+    kinds = {"fixed": ~moved, "moved": moved}
+    shown = tuple(name for name, some in kinds.items() if some.any())
+    return Sheet(width, height, Legend(paint.scale, paint.label, shown))

@@ -65,7 +65,7 @@ class Stage:
         plotter = self.plotter
         plotter.clear_actors()
         # Single precision is enough near the origin and at size 1, whatever the mesh's unit.
-        pose = within_reach((pose - view.focus) / view.depth)
+        pose = in_view(pose, view)
         self._add_surface(pose, coat)
         if dots is not None:
             self._add_dots(pose, dots)
@@ -153,8 +153,12 @@ def _polygons(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Any
     return drawn
 
 
-def within_reach(pose: np.ndarray) -> np.ndarray:
-    """Pull what flies off toward the middle until single precision can hold it, out of view."""
+def in_view(pose: np.ndarray, view: View) -> np.ndarray:
+    """Return the pose about the middle of the view, in units of its depth.
+
+    What flies off is pulled toward the middle until single precision can hold it, out of view.
+    """
+    pose = (pose - view.focus) / view.depth
     scale = np.abs(pose).max(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
         return np.where(scale > _REACH, pose / scale * _REACH, pose)

@@ -4,6 +4,7 @@ import base64
 import html
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -15,12 +16,11 @@ from jaxdeform._checks import check_count, read_path
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.writing import check_place, write_atomically
-from jaxdeform._plotting.arguments import Paint, find_faults, read_look, read_paint, read_poses
-from jaxdeform._plotting.camera import View, find_view
+from jaxdeform._plotting.arguments import Paint, read_look, read_poses
+from jaxdeform._plotting.camera import View
 from jaxdeform._plotting.files import check_can_draw, png
-from jaxdeform._plotting.render import framing, panel_height, shown_handles
-from jaxdeform._plotting.scene import FIXED, MOVED, Dots, Stage, within_reach
-from jaxdeform._plotting.sheet import Legend, Sheet
+from jaxdeform._plotting.render import panel_height, set_up, sheet_of
+from jaxdeform._plotting.scene import FIXED, MOVED, Dots, Stage, in_view
 from jaxdeform._plotting.surface import Surface
 from jaxdeform._plotting.texture import seen_at_vertices
 
@@ -125,18 +125,11 @@ def show(
         if not np.isfinite(pose).all():
             vertex = int(np.flatnonzero(~np.isfinite(pose).all(axis=1))[0])
             raise InputError(f"poses[{k}]: vertex {vertex} is not finite: leave this pose out")
-    surface = Surface(mesh)
-    faults = find_faults(mesh, arrays)
-    paint = read_paint(surface, arrays, faults, values, label)
-    (view,) = find_view(framing(mesh, arrays, faults), look.up, np.zeros(1))
-    height, dots = panel_height(width, view), look.dots(arrays)
-    stage = Stage(surface, width, height, edges=False)
-    try:
+    surface, _, paint, (view,), dots = set_up(look, arrays, values, label)
+    height = panel_height(width, view)
+    with closing(Stage(surface, width, height, edges=False)) as stage:
         panel = stage.draw(arrays[0], paint.coats[0], view, dots)
-    finally:
-        stage.close()
-    sheet = Sheet(width, height, Legend(paint.scale, paint.label, shown_handles(dots)))
-    picture = png(sheet.arrange([panel], [[]], columns=1))
+    picture = png(sheet_of(width, height, paint, dots).arrange([panel], [[]], columns=1))
     return Turnable(_page(surface, arrays, paint, view, dots), picture, width, height)
 
 
@@ -145,13 +138,10 @@ def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) 
     import k3d  # slow to import, and needed only here
     from ipywidgets import Widget  # comes with k3d
 
-    coats = [
-        seen_at_vertices(surface.mesh, surface.textures, coat.colors)
-        if coat.textured
-        else coat.colors
-        for coat in paint.coats
-    ]
-    near = [within_reach((pose - view.focus) / view.depth) for pose in poses]
+    textured = [coat.colors for coat in paint.coats if coat.textured]  # all alike
+    own = [seen_at_vertices(surface.mesh, surface.textures, plain) for plain in textured[:1]]
+    colors = [own[0] if coat.textured else coat.colors for coat in paint.coats]
+    near = [in_view(pose, view) for pose in poses]
     plot: Any = k3d.factory.plot(
         grid_visible=False,
         menu_visibility=False,
@@ -167,7 +157,7 @@ def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) 
         _over_time([pose[surface.index] for pose in near]),
         surface.faces.astype(np.uint32),
         normals=_over_time([surface.normals(pose) for pose in near]),
-        colors=_over_time([_packed(coat[surface.index]) for coat in coats], np.uint32),
+        colors=_over_time([_packed(color[surface.index]) for color in colors], np.uint32),
         flat_shading=False,
         side="double",
     )

@@ -30,9 +30,11 @@ class Texture(NamedTuple):
 def textures_of(mesh: Mesh) -> list[Texture]:
     """Return the images of a mesh. One that cannot be read is left out, with a warning."""
     source = mesh.source
-    painted = images_of(source) if source is not None else []
-    at_corners = file_texture(source) if source is not None and painted else None
-    if source is None or at_corners is None:
+    if source is None:
+        return []
+    painted = images_of(source)
+    at_corners = file_texture(source) if painted else None
+    if at_corners is None:
         return []
     sizes, corners = source.polygons
     polygon = np.repeat(np.arange(len(sizes)) * mesh.n_vertices, sizes - 2)
