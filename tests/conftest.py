@@ -61,6 +61,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Forget what was compiled once a process has many memory maps.
+
+    Each program has three or more of them, without optimisation more. At 65,530 Linux refuses the
+    next, and XLA ends the process: the slow tests reached that. A file adds up to 17,000.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 25_000:
+        jax.clear_caches()
+        gc.collect()
+
+
 @pytest.fixture(scope="session")
 def bar() -> jd.Mesh:
     return jd.shapes.bar()
