@@ -43,8 +43,9 @@ from ._errors import InputError
 from ._estimation.discrepancy import Discrepancy
 from ._estimation.estimate import Estimate
 from ._estimation.field import FieldEstimate, estimate_rigidity_field
+from ._estimation.found_handles import find_handle_groups, find_handles
 from ._estimation.parts import estimate_rigidity
-from ._estimation.rigid_groups import RigidGroup, find_handle_groups, find_handles
+from ._estimation.rigid_groups import RigidGroup
 from ._estimation.segments import segment_rigidity
 from ._estimation.thesis import ThesisEstimate, estimate_rigidity_thesis
 from ._estimation.verdict import Verdict

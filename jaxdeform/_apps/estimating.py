@@ -14,6 +14,7 @@ from jaxdeform._apps.arguments import choose_parts, read_pose
 from jaxdeform._apps.results import as_json, save_result
 from jaxdeform._apps.talk import console, patiently, say_wrote, since
 from jaxdeform._errors import printable
+from jaxdeform._estimation.found_handles import search_handles
 from jaxdeform._estimation.held_out import prediction_errors
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
 from jaxdeform._mesh.writing import check_place, write_atomically
@@ -38,12 +39,12 @@ def estimate(
         ),
     ] = None,
     tolerance: Annotated[
-        float,
+        float | None,
         typer.Option(
             help="How exactly handles must have moved rigidly to be found, as a fraction of the "
-            "bounding box diagonal."
+            "bounding box diagonal. By default four times the noise that is found."
         ),
-    ] = 1e-6,
+    ] = None,
     rings: Annotated[int, typer.Option(min=1, help="Size of the cells, in rings of vertices.")] = 1,
     steps: Annotated[
         int | None,
@@ -149,12 +150,20 @@ def _report_held_out(
     console.print(table)
 
 
-def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float) -> np.ndarray:
-    groups = jd.find_handle_groups(mesh, observed, tolerance=tolerance)
-    sizes = ", ".join(str(len(group.vertices)) for group in groups[:10])
-    more = ", ..." if len(groups) > 10 else ""
-    console.print(f"handles: {len(groups)} groups of vertices moved rigidly ({sizes}{more})")
-    return np.unique(np.concatenate([group.vertices for group in groups]))
+def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None) -> np.ndarray:
+    found = search_handles(mesh, observed, tolerance)
+    sizes = ", ".join(str(len(group.vertices)) for group in found.groups[:10])
+    more = ", ..." if len(found.groups) > 10 else ""
+    console.print(
+        f"handles: {len(found.groups)} groups of vertices moved rigidly ({sizes}{more}), within "
+        f"{found.tolerance:.2g} of the diagonal"
+    )
+    if found.doubt:
+        console.print(
+            f"the estimate depends on that: {found.doubt}. Compare --tolerance "
+            f"{2 * found.tolerance:.2g}, or give --handles"
+        )
+    return found.vertices
 
 
 def _show_evaluation(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:
