@@ -3,7 +3,7 @@
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
@@ -18,6 +18,7 @@ from jaxdeform._estimation.found_handles import search_handles
 from jaxdeform._estimation.held_out import prediction_errors
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
 from jaxdeform._mesh.writing import check_place, write_atomically
+from jaxdeform._plotting.files import check_picture_path
 
 
 def estimate(
@@ -58,15 +59,26 @@ def estimate(
             "beside ARAP. Found handles are those of all poses.",
         ),
     ] = 0,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="PNG file for a picture of all shapes with the handles marked, before the search "
+            "begins; after it the rigidity is the colour."
+        ),
+    ] = None,
 ) -> None:
     """Estimate the rigidity of a mesh or of its parts from deformed poses."""
     _check_hold_out(hold_out, len(poses))
+    if picture is not None:
+        check_picture_path(picture)
     shape = jd.load_mesh(rest)
     report = _check_names(out)
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
     label = choose_parts(parts, part or [], shape)
     known = jd.load_handles(handles, shape).handles if handles else None
     index = _moved_rigidly(shape, observed, tolerance) if known is None else known
+    draw = _Picture(picture, shape, [rest, *poses], observed, index).draw
+    draw()
     began = time.perf_counter()
     cells = jd.rings(shape, rings)
     problem = patiently("precomputing", lambda: jd.precompute(shape, index, cells=cells))
@@ -74,11 +86,35 @@ def estimate(
     fit = _fit(problem, fitted, label, steps)
     failed = _saved(out, report, shape, fit, index)
     console.print(f"{fit.explain()}\nestimated in {since(began)}")
+    draw(fit.field)
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
     if failed:
         raise failed
     say_wrote(out, report)
+
+
+class _Picture(NamedTuple):
+    """All shapes beside each other with the handles marked, if a file is named for them."""
+
+    path: Path | None
+    shape: jd.Mesh
+    names: list[Path]
+    observed: np.ndarray
+    handles: np.ndarray
+
+    def draw(self, rigidity: np.ndarray | None = None) -> None:
+        if self.path is None:
+            return
+        jd.render(
+            self.path,
+            self.shape,
+            [self.shape.vertices, *self.observed],
+            titles=[printable(name.name) for name in self.names],
+            values=[] if rigidity is None else [rigidity] * len(self.names),
+            handles=self.handles,
+        )
+        say_wrote(self.path)
 
 
 def _saved(

@@ -118,7 +118,8 @@ def search_handles(mesh: Mesh, deformed: ArrayLike, tolerance: float | None) -> 
         raise InputError(
             "no handles found: nowhere did a vertex and its neighbors move rigidly within "
             f"{chosen * diagonal:.3g}; raise the tolerance ({chosen:.3g} of the diagonal) to about "
-            "four times the noise, or name the handles yourself"
+            "four times the noise, or name the handles yourself. Where nothing is rigid, as in a "
+            "face, take each fifteenth vertex or so, with precompute(..., handle_weights=10.0)"
         )
     found = FoundHandles(groups, chosen, "")
     if tolerance is not None:

@@ -39,9 +39,12 @@ def test_command_predicts_a_pose_that_was_held_out(run, tmp_path, bar, bar_probl
     ):
         pose = jd.deform(bar_problem, targets, 0.3).vertices
         jd.save_mesh(name, bar, vertices=pose)
-    options = ["--hold-out", 1, "-o", tmp_path / "out.ply"]
+    picture = tmp_path / "shapes.png"
+    options = ["--hold-out", 1, "-o", tmp_path / "out.ply", "--picture", picture]
     code, shown, _ = run("estimate", *names, *options)
     assert code == 0
+    assert shown.index(f"wrote {picture}") < shown.index("evaluation 1:")
+    assert shown.count(f"wrote {picture}") == 2
     (line,) = [line for line in shown.splitlines() if "twist.ply" in line]
     ours, arap = (float(word) for word in line.replace("\u2502", " ").split()[1:3])
     assert ours < 0.01 < arap
@@ -68,6 +71,7 @@ def test_command_refuses_what_does_not_fit(run, tmp_path, bar):
     for arguments, message in (
         ([rest, other, "-o", out], "other.ply: is not a pose of"),
         ([rest, rest, "-o", tmp_path / "out.obj"], "only PLY"),
+        ([rest, rest, "-o", out, "--picture", tmp_path / "p.jpg"], "p.jpg"),
         ([rest, rest, "-o", out, "--parts", tmp_path / "short.txt"], "parts have shape"),
         (
             [rest, rest, "-o", out, "--parts", tmp_path / "words.json"],

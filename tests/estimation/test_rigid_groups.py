@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import NOISE, noisy, real_mesh
+from helpers import noisy, real_mesh
 
 import jaxdeform as jd
 
