@@ -70,7 +70,8 @@ class Estimate:
         """Return everything in words, a line for each part and each fact."""
         lines = [self._explain_part(k) for k in range(len(self.rigidity))]
         lines.append(
-            f"misfit {self.misfit:.3g}, {100 * self.relative_misfit:.2g} % of the diagonal "
+            f"rigidity in squared mesh units; misfit {self.misfit:.3g} mesh units, "
+            f"{100 * self.relative_misfit:.2g} % of the diagonal "
             f"({len(self.history)} evaluations)"
         )
         if self.misfit <= self.solver_error:

@@ -81,6 +81,7 @@ def test_a_stiff_bar_is_at_least_so_stiff(bar, bar_problem, bar_targets, equilib
     assert 100 < fit.interval[0, 0] < 1e6
     assert np.isinf(fit.interval[0, 1])
     assert f"at least {fit.interval[0, 0]:.3g}" in fit.explain()
+    assert "rigidity in squared mesh units; misfit" in fit.explain()
 
 
 @pytest.mark.slow
