@@ -20,6 +20,22 @@ from jaxdeform._mesh.files import check_output, format_of, without_suffix
 from jaxdeform._mesh.writing import check_place, write_atomically
 from jaxdeform._plotting.files import check_picture_path
 
+_HoldOut = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        help="Leave out so many poses, the last ones, and report how well they are predicted, "
+        "beside ARAP. Found handles are those of all poses.",
+    ),
+]
+_PictureFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="PNG file for a picture of all shapes with the handles marked, before the search "
+        "begins; after it the rigidity is the colour."
+    ),
+]
+
 
 def estimate(
     rest: Annotated[Path, typer.Argument(help="The undeformed mesh: OBJ, OFF, PLY or STL file.")],
@@ -51,21 +67,8 @@ def estimate(
         int | None,
         typer.Option(min=1, help="Number of alternating steps. By default, until convergence."),
     ] = None,
-    hold_out: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Leave out so many poses, the last ones, and report how well they are predicted, "
-            "beside ARAP. Found handles are those of all poses.",
-        ),
-    ] = 0,
-    picture: Annotated[
-        Path | None,
-        typer.Option(
-            help="PNG file for a picture of all shapes with the handles marked, before the search "
-            "begins; after it the rigidity is the colour."
-        ),
-    ] = None,
+    hold_out: _HoldOut = 0,
+    picture: _PictureFile = None,
 ) -> None:
     """Estimate the rigidity of a mesh or of its parts from deformed poses."""
     _check_hold_out(hold_out, len(poses))
