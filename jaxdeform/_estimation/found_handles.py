@@ -1,7 +1,7 @@
 """Finding handles: vertices that moved rigidly, and how exactly they must have."""
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -93,7 +93,7 @@ def find_handle_groups(
     return _undoubted(mesh, deformed, tolerance).groups
 
 
-def _undoubted(mesh: Mesh, deformed: ArrayLike, tolerance: float | None) -> FoundHandles:
+def _undoubted(mesh: Any, deformed: Any, tolerance: Any) -> FoundHandles:
     found = search_handles(mesh, deformed, tolerance)
     if found.doubt:
         warnings.warn(
@@ -102,8 +102,8 @@ def _undoubted(mesh: Mesh, deformed: ArrayLike, tolerance: float | None) -> Foun
     return found
 
 
-def search_handles(mesh: Mesh, deformed: ArrayLike, tolerance: float | None) -> FoundHandles:
-    """Find the groups and say how, as `find_handle_groups` does."""
+def search_handles(mesh: Any, deformed: Any, tolerance: Any) -> FoundHandles:
+    """Check the arguments of `find_handle_groups`, find the groups and say how."""
     check_type("mesh", mesh, Mesh)
     poses = _check_deformed(deformed, mesh.n_vertices)
     if tolerance is not None:

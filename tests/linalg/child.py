@@ -140,6 +140,8 @@ def hurried(file: Path) -> None:
 
 def interrupted(file: Path, once: int) -> None:
     """Press Ctrl-C while a deformation, or an estimate, runs that would take half an hour."""
+    # Shells make background jobs deaf to it, and Python leaves that so.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     made = problem()
     pose = np.asarray(deformed(made))
     np.save(file, pose)
