@@ -199,8 +199,8 @@ def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None)
     )
     if found.doubt:
         console.print(
-            f"the estimate depends on that: {found.doubt}. Compare --tolerance "
-            f"{2 * found.tolerance:.2g}, or give --handles"
+            f"the estimate depends on that: {found.doubt}. Compare another --tolerance, or give "
+            "--handles"
         )
     return found.vertices
 

@@ -40,9 +40,10 @@ class Discrepancy(NamedTuple):
         """Return it in words, with what to try next."""
         if not self.found:
             return "the model explains the poses: what it leaves is independent noise"
+        share = f"{100 * self.share:.2g}" if self.share < 1 else f"{100 * self.share:,.0f}"
         text = (
             f"the model does not explain these poses: a smooth part of {self.size:.2g} is left "
-            f"({100 * self.relative:.2g} % of the diagonal, {100 * self.share:.2g} % of what "
+            f"({100 * self.relative:.2g} % of the diagonal, {share} % of what "
             f"rigidity can do), the most at vertex {self.vertex} of pose {self.pose}. "
         )
         if self.relative > _FOREIGN:
