@@ -53,6 +53,8 @@ _FLOAT32_MIXES = (1e-5, 1e-3, 0.1)
 
 # It is used where this part of all cells is softer than this constant (rigidity_from_material).
 _SOFT_PART, _SOFT = 0.1, 1.0
+# Softer cells count as of this constant.
+_LEAST = 1e-6
 
 Choice = Literal["auto", "material", "stiffness"]
 
@@ -133,7 +135,8 @@ def _key_on_host(out, *operands) -> None:
         usable = bool(np.isfinite(rigidity).all() and (rigidity >= 0).all())
         if usable and (always or _is_soft(rigidity, parts.moments)):
             digest = hashlib.blake2b(digest_size=16)
-            for array in (_rounded_up(rigidity), parts.key, parts.moments, *parts.covariance):
+            rounded = _rounded_up(rigidity, parts.moments)
+            for array in (rounded, parts.key, parts.moments, *parts.covariance):
                 digest.update(np.ascontiguousarray(array).data)
             out[member] = np.frombuffer(digest.digest(), np.uint32)
         else:
@@ -141,15 +144,21 @@ def _key_on_host(out, *operands) -> None:
 
 
 def _is_soft(rigidity: np.ndarray, moments: np.ndarray) -> bool:
-    area = np.maximum(moments.sum(axis=0), 0.0) / 2.0
+    area = _area(moments)
     cells = np.count_nonzero(area)  # without the empty ones
     return bool(np.sum(rigidity < _SOFT * area) >= _SOFT_PART * max(cells, 1))
 
 
-def _rounded_up(rigidity: np.ndarray) -> np.ndarray:
-    """Return the next half octave; 0 stays 0."""
+def _rounded_up(rigidity: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Return the next half octave, and at least what keeps the metric regular."""
+    felt = np.maximum(rigidity.astype(np.float64), _LEAST * _area(moments))
     with np.errstate(divide="ignore"):
-        return np.exp2(np.ceil(2.0 * np.log2(rigidity.astype(np.float64))) / 2.0)
+        return np.exp2(np.ceil(2.0 * np.log2(felt)) / 2.0)
+
+
+def _area(moments: np.ndarray) -> np.ndarray:
+    """Return tr(B) / 2 of each cell, which is about its area."""
+    return np.maximum(moments.sum(axis=0), 0.0) / 2.0
 
 
 def _solve_on_host(out, *operands) -> None:
@@ -197,7 +206,7 @@ def _make(rigidity: np.ndarray, parts: _Parts, dtype: np.dtype) -> HostFactor:
         n = len(parts.free)
         excess = np.asarray(pull.sum(axis=1)).ravel()
         pull = pull - sp.csr_matrix((excess, (np.arange(3 * n), np.tile(np.arange(n), 3))))
-    inverse = compliance(parts.moments, _rounded_up(rigidity)).ravel()
+    inverse = compliance(parts.moments, _rounded_up(rigidity, parts.moments)).ravel()
     softened = pull.T @ sp.diags(inverse) @ pull
     for mix in _FLOAT32_MIXES if dtype == np.float32 else _MIXES:
         matrix = Matrix.of(stiffness - (1.0 - mix) * softened, parts.free)

@@ -21,7 +21,8 @@ def small(exact_sizes):
     return jd.precompute(mesh, np.flatnonzero(mesh.vertices[:, 1] < 0.1))
 
 
-def _sheet(n: int = 4) -> jd.Mesh:
+def _sheet(n: int = 4, shear: float = 0.0) -> jd.Mesh:
+    """Return a bumpy sheet; sheared by a half, half of its triangles are obtuse."""
     grid = np.linspace(0.0, 1.0, n)
     x, y = (v.ravel() for v in np.meshgrid(grid, grid, indexing="ij"))
     bumps = 0.15 * np.sin(7.0 * x) * np.cos(5.0 * y)
@@ -30,7 +31,7 @@ def _sheet(n: int = 4) -> jd.Mesh:
         v.ravel() for v in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
     )
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    return jd.Mesh(np.stack([x, y, bumps], axis=1), faces)
+    return jd.Mesh(np.stack([x + shear * y, y, bumps], axis=1), faces)
 
 
 def _brute_force(problem: jd.Problem, rigidity: float) -> np.ndarray:
@@ -62,10 +63,14 @@ def _inverse(problem: jd.Problem, rigidity: float, choice) -> np.ndarray:
     return np.asarray(jax.vmap(lambda x: apply_metric(system, metric, x))(unit)[:, 0])
 
 
-def test_it_is_the_formula(small):
-    free, lam = np.asarray(small.system.free), 2.0**-5  # a half octave, so not rounded up
-    expected = np.linalg.inv(_brute_force(small, lam)[np.ix_(free, free)])
-    found = _inverse(small, lam, "material")
+@pytest.mark.parametrize("shear", [0.0, 0.5])
+def test_it_is_the_formula(exact_sizes, shear):
+    mesh = _sheet(shear=shear)
+    problem = jd.precompute(mesh, np.flatnonzero(mesh.vertices[:, 1] < 0.1))
+    assert shear == 0 or (problem.cells.weights < 0).any()  # obtuse, and yet bounded
+    free, lam = np.asarray(problem.system.free), 2.0**-5  # a half octave, so not rounded up
+    expected = np.linalg.inv(_brute_force(problem, lam)[np.ix_(free, free)])
+    found = _inverse(problem, lam, "material")
     np.testing.assert_allclose(found[np.ix_(free, free)], expected, rtol=1e-8, atol=1e-10)
     assert not found[~free].any()
     assert not found[:, ~free].any()
@@ -106,6 +111,32 @@ def test_it_ends_where_stiffness_ends(bar, bar_problem, bar_targets, kind, rigid
         out = jd.deform(problem, bar_targets, rigidity, solver=solver, local=local)
         assert bool(out.ok)
         assert np.all(np.diff(out.energy) <= 1e-12 * np.abs(out.energy[0]))
+        ends[choice] = float(out.energy[-1])
+    assert ends["material"] <= ends["stiffness"] * (1 + 1e-6) + 1e-9
+
+
+@pytest.mark.filterwarnings("ignore:negative weights:UserWarning")
+@pytest.mark.filterwarnings("ignore:weights of 0 made the system singular:UserWarning")
+@pytest.mark.parametrize("rigidity", [0.0, 1e-2])
+@pytest.mark.parametrize("kind", ["rings", "spokes"])
+def test_obtuse_triangles(kind, rigidity):
+    """Cells of rings keep their negative weights; those of spokes count as 0, and some are flat.
+
+    There the metric of rigidity 0 was singular, and led out to 1e74.
+    """
+    mesh = _sheet(8, shear=0.5)
+    cells = jd.rings(mesh, 1) if kind == "rings" else jd.spokes(mesh)
+    handles = jd.select.where(mesh, "v < 0.1 or v > 0.9")
+    problem = jd.precompute(mesh, handles, cells=cells)
+    assert (problem.cells.weights < 0).any() == (kind == "rings")
+    upper = mesh.vertices[problem.handles, 1:2] > 0.5
+    targets = mesh.vertices[problem.handles] + upper * np.array([0.2, -0.3, 0.4])
+    ends = {}
+    for choice in ("stiffness", "material"):
+        solver = jd.QuasiNewton(tolerance=1e-9, max_steps=2000, metric=choice)
+        out = jd.deform(problem, targets, rigidity, solver=solver)
+        assert bool(out.ok)
+        assert np.abs(out.vertices).max() < 2.0
         ends[choice] = float(out.energy[-1])
     assert ends["material"] <= ends["stiffness"] * (1 + 1e-6) + 1e-9
 
