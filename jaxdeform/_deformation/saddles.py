@@ -97,12 +97,14 @@ def leave_saddles(
     a way on ends higher, as it may in a crumpled mesh, a shorter one is tried.
     """
     negative = -1e-5 if start.dtype == jnp.float64 else -1e-3
+    # The energy is a difference of sums some 600 times as large.
+    rounding = 1e3 * jnp.finfo(start.dtype).eps
 
     def descend_on(way: _Way) -> _Way:
         first = way.turn == 0
         end = descend(jnp.where(first, start, way.best.p + way.along))
         old, new = way.best.energy[way.best.steps], end.energy[end.steps]
-        margin = settings.tolerance * jnp.abs(old)
+        margin = jnp.maximum(settings.tolerance, rounding) * jnp.abs(old)
         lower, higher = first | (new < old - margin), ~first & ~(new <= old + margin)
         value, along = curvature(end.p, end.transforms, end.converged)
         longest = jnp.sqrt(jnp.max(jnp.sum(along**2, axis=0)))

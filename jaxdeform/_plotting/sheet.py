@@ -149,7 +149,9 @@ class Sheet:
         em, font = self.type, self.font
         title = self._shortened(self.legend.label, max(across // 2, 1))
         words = round(font.getlength(title))
-        length = max(2, min(15 * em, across - words - 6 * em))
+        widest = max(font.getlength(written(mark)) for mark in scale.marks(closest=0.0))
+        apart = round(widest) + em // 2  # from number to number, so that they do not touch
+        length = max(apart, min(15 * em, across - words - 6 * em))
         left = words + 3 * em
         wide, tall = left + length + 3 * em, 4 * em
         image = Image.new("RGB", (wide, tall), "white")
@@ -158,7 +160,7 @@ class Sheet:
         pen.text((em, top + thick / 2), title, fill=_INK, font=font, anchor="lm")
         ramp = np.rint(255 * scale.bar(length)).astype(np.uint8)
         image.paste(Image.fromarray(np.repeat(ramp[None], thick, axis=0)), (left, top))
-        for mark in scale.marks(closest=min(1.0, 3.2 * em / length)):
+        for mark in scale.marks(closest=min(1.0, max(3.2 * em, apart) / length)):
             x = left + float(scale.place(np.array(mark))) * (length - 1)
             pen.line([(x, top + thick), (x, top + thick + em // 4)], fill=_FAINT)
             place = (x, top + thick + em // 3)
