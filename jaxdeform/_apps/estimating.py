@@ -72,6 +72,8 @@ def estimate(
 ) -> None:
     """Estimate the rigidity of a mesh or of its parts from deformed poses."""
     _check_hold_out(hold_out, len(poses))
+    if handles and tolerance is not None:
+        raise jd.InputError("--tolerance is for handles that are to be found: leave out --handles")
     if picture is not None:
         check_picture_path(picture)
     shape = jd.load_mesh(rest)
@@ -89,12 +91,12 @@ def estimate(
     fit = _fit(problem, fitted, label, steps)
     failed = _saved(out, report, shape, fit, index)
     console.print(f"{fit.explain()}\nestimated in {since(began)}")
-    draw(fit.field)
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
     if failed:
         raise failed
     say_wrote(out, report)
+    draw(fit.field)
 
 
 class _Picture(NamedTuple):
@@ -190,7 +192,7 @@ def _report_held_out(
 
 
 def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None) -> np.ndarray:
-    found = search_handles(mesh, observed, tolerance)
+    found = patiently("finding handles", lambda: search_handles(mesh, observed, tolerance))
     sizes = ", ".join(str(len(group.vertices)) for group in found.groups[:10])
     more = ", ..." if len(found.groups) > 10 else ""
     console.print(

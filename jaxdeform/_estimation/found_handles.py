@@ -12,9 +12,9 @@ from jaxdeform._estimation.poses import read_poses
 from jaxdeform._estimation.rigid_groups import RigidGroup, RigidGroups
 from jaxdeform._mesh.mesh import LARGEST, Mesh
 
-# So many times the noise floor, about four standard deviations of the noise: of a thousand vertices
-# that moved rigidly one is farther off. But at least so much of the diagonal (rounding of float32),
-# and at most so much: then it is no noise.
+# So many times the noise floor, about four standard deviations of the noise in one pose: of a
+# thousand vertices that moved rigidly two are farther off. But at least so much of the diagonal
+# (rounding of float32), and at most so much: then it is no noise.
 _NOISES, _LEAST, _MOST = 7.0, 1e-6, 1e-2
 # The handles are in doubt if twice the tolerance finds so many times more, or if so large a share
 # of the edges that leave a group lead to another one while more than half of the mesh is handles.
@@ -75,11 +75,13 @@ def find_handle_groups(
     - mesh: the rest shape.
     - deformed: (n, 3) or (poses, n, 3) positions.
     - tolerance: how far a vertex may be from the motion of its group, as a fraction of the bounding
-      box diagonal. By default about four standard deviations of the noise, which is taken from the
-      1-rings that moved most rigidly; between 1e-6 and 1e-2.
+      box diagonal. By default 1e-6 where twice that finds no others. Else about four standard
+      deviations of the noise (more in many poses), taken from the 1-rings that moved most rigidly:
+      one in 200, at least five. So handles must have that many; up to 1e-2.
 
     **Returns** the groups, the largest first. A warning tells if the noise decides which vertices
-    are handles: if twice the default tolerance finds a fifth more, or if the groups touch.
+    are handles: if twice the default tolerance finds a fifth more, or if the groups touch and are
+    more than half of the mesh. On fine meshes noise may hide that: look at the groups.
 
     **Raises** InputError: shapes that do not fit, positions that are not finite, no group found.
 
@@ -110,21 +112,30 @@ def search_handles(mesh: Any, deformed: Any, tolerance: Any) -> FoundHandles:
         check_tolerance("tolerance", tolerance, positive=True)
     search = RigidGroups(mesh, poses)
     diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    chosen = tolerance
-    if chosen is None:
-        chosen = min(max(_NOISES * search.noise_floor() / diagonal, _LEAST), _MOST)
-    groups = search.within(chosen * diagonal)
+    if tolerance is not None:
+        return FoundHandles(_groups_within(search, tolerance, diagonal), tolerance, "")
+    # Exact poses first: their noise floor is that of what bends where handles are few.
+    exact = FoundHandles(search.within(_LEAST * diagonal), _LEAST, "")
+    if exact.groups and not _doubt(mesh, exact, search.within(2 * _LEAST * diagonal)):
+        return exact
+    chosen = min(max(_NOISES * search.noise_floor() / diagonal, _LEAST), _MOST)
+    found = FoundHandles(_groups_within(search, chosen, diagonal), chosen, "")
+    return found._replace(doubt=_doubt(mesh, found, search.within(2 * chosen * diagonal)))
+
+
+def _groups_within(
+    search: RigidGroups, tolerance: float, diagonal: float
+) -> tuple[RigidGroup, ...]:
+    groups = search.within(tolerance * diagonal)
     if not groups:
         raise InputError(
             "no handles found: nowhere did a vertex and its neighbors move rigidly within "
-            f"{chosen * diagonal:.3g}; raise the tolerance ({chosen:.3g} of the diagonal) to about "
-            "four times the noise, or name the handles yourself. Where nothing is rigid, as in a "
-            "face, take each fifteenth vertex or so, with precompute(..., handle_weights=10.0)"
+            f"{tolerance * diagonal:.3g} ({tolerance:.3g} of the diagonal); raise the tolerance to "
+            "about four times the noise, or name the handles yourself. Where nothing is rigid, as "
+            "in a face, take each fifteenth vertex or so, with precompute(..., "
+            "handle_weights=10.0), for a rough estimate"
         )
-    found = FoundHandles(groups, chosen, "")
-    if tolerance is not None:
-        return found
-    return found._replace(doubt=_doubt(mesh, found, search.within(2 * chosen * diagonal)))
+    return groups
 
 
 def _doubt(mesh: Mesh, found: FoundHandles, wider: tuple[RigidGroup, ...]) -> str:

@@ -51,11 +51,12 @@ class RigidGroups:
     def noise_floor(self) -> float:
         """Return the noise (a length) of the rings that moved most rigidly.
 
-        It is the RMS distance from a ring's own rigid motion, of the fifth ring from below, or on
-        large meshes of one in 200: in noise alone about 0.55 times its standard deviation.
+        It is the RMS of a coordinate about a ring's own rigid motion, of the fifth ring from below,
+        or on large meshes of one in 200: with six neighbors, one pose and noise alone about 0.55
+        times its standard deviation.
         """
         errors = np.sort(self._rings.mean[np.isfinite(self._rings.mean)])
-        return float(errors[min(max(4, len(errors) // 200), len(errors) - 1)]) if len(errors) else 0
+        return float(errors[min(max(4, len(errors) // 200), len(errors) - 1)])
 
     def within(self, reach: float) -> tuple[RigidGroup, ...]:
         """Return the groups whose vertices follow their motion within ``reach``, the largest first.

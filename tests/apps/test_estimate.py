@@ -72,6 +72,10 @@ def test_command_refuses_what_does_not_fit(run, tmp_path, bar):
         ([rest, other, "-o", out], "other.ply: is not a pose of"),
         ([rest, rest, "-o", tmp_path / "out.obj"], "only PLY"),
         ([rest, rest, "-o", out, "--picture", tmp_path / "p.jpg"], "p.jpg"),
+        (
+            [rest, rest, "-o", out, "--handles", rest, "--tolerance", 1e-3],
+            "--tolerance is for handles that are to be found",
+        ),
         ([rest, rest, "-o", out, "--parts", tmp_path / "short.txt"], "parts have shape"),
         (
             [rest, rest, "-o", out, "--parts", tmp_path / "words.json"],

@@ -48,6 +48,18 @@ def test_where_noise_hides_the_handles_that_is_said(rest, pose):
         jd.find_handles(rest, _noised(rest, pose, 1e-3))
 
 
+@pytest.mark.parametrize("rigidity", [0.1, 30.0])
+def test_few_handles_of_an_exact_pose_are_found(bar, rigidity):
+    """Two vertices with their neighbors: fewer rings than the noise is taken from."""
+    rings = [np.append(bar.edges[(bar.edges == k).any(axis=1)].ravel(), k) for k in (200, 500)]
+    lower, upper = map(np.unique, rings)
+    handles = np.concatenate([lower, upper])
+    targets = bar.vertices[handles].copy()
+    targets[len(lower) :] += [5.0, 20.0, 10.0]
+    pose = jd.deform(jd.precompute(bar, handles), targets, rigidity).vertices
+    np.testing.assert_array_equal(jd.find_handles(bar, pose), np.sort(handles))
+
+
 def _noised(rest: jd.Mesh, pose: jd.Mesh, noise: float) -> np.ndarray:
     draw = np.random.default_rng(0).standard_normal(pose.vertices.shape)
     return pose.vertices + noise * rest.diagonal * draw
