@@ -195,8 +195,9 @@ def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None)
     found = patiently("finding handles", lambda: search_handles(mesh, observed, tolerance))
     sizes = ", ".join(str(len(group.vertices)) for group in found.groups[:10])
     more = ", ..." if len(found.groups) > 10 else ""
+    count = "1 group" if len(found.groups) == 1 else f"{len(found.groups)} groups"
     console.print(
-        f"handles: {len(found.groups)} groups of vertices moved rigidly ({sizes}{more}), within "
+        f"handles: {count} of vertices moved rigidly ({sizes}{more}), within "
         f"{found.tolerance:.2g} of the diagonal"
     )
     if found.doubt:
