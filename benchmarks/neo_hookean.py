@@ -66,7 +66,7 @@ def solid_box(cells: tuple[int, int, int], size: tuple[float, float, float]) -> 
 
 def _edges(nodes, tetrahedra):
     corner = nodes[tetrahedra]
-    return jnp.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2)
+    return np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2)
 
 
 class NeoHookean:
@@ -74,7 +74,7 @@ class NeoHookean:
 
     def __init__(self, solid: Solid, young: Float[np.ndarray, "tetrahedra"], poisson: float = 0.4):
         young = np.broadcast_to(np.asarray(young, float), len(solid.tetrahedra))
-        edges = np.array(_edges(solid.nodes, solid.tetrahedra))
+        edges = _edges(solid.nodes, solid.tetrahedra)
         self.solid = solid
         self._inverse = np.linalg.inv(edges)
         volume = np.linalg.det(edges) / 6.0

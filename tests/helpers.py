@@ -115,10 +115,10 @@ def held_sheet():
     return mesh, handles, np.asarray(jd.bend(mesh.vertices[handles], 60.0, along="x", toward="z"))
 
 
-def noisy(mesh: jd.Mesh, pose: np.ndarray, seed: int) -> np.ndarray:
+def noisy(mesh: jd.Mesh, pose: np.ndarray, seed: int, noise: float = NOISE) -> np.ndarray:
     """Return the pose with independent noise at every coordinate."""
     draw = np.random.default_rng(seed).standard_normal(pose.shape)
-    return pose + NOISE * mesh.diagonal * draw
+    return pose + noise * mesh.diagonal * draw
 
 
 def moved(mesh):

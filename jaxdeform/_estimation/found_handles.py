@@ -111,35 +111,33 @@ def search_handles(mesh: Any, deformed: Any, tolerance: Any) -> FoundHandles:
     if tolerance is not None:
         check_tolerance("tolerance", tolerance, positive=True)
     search = RigidGroups(mesh, poses)
-    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if tolerance is not None:
-        return FoundHandles(_groups_within(search, tolerance, diagonal), tolerance, "")
+        return FoundHandles(_groups_within(search, tolerance), tolerance, "")
     # Exact poses first: their noise floor is that of what bends where handles are few.
-    exact = FoundHandles(search.within(_LEAST * diagonal), _LEAST, "")
-    if exact.groups and not _doubt(mesh, exact, search.within(2 * _LEAST * diagonal)):
+    exact = FoundHandles(search.within(_LEAST), _LEAST, "")
+    if exact.groups and not _doubt(search, exact):
         return exact
-    chosen = min(max(_NOISES * search.noise_floor() / diagonal, _LEAST), _MOST)
-    found = FoundHandles(_groups_within(search, chosen, diagonal), chosen, "")
-    return found._replace(doubt=_doubt(mesh, found, search.within(2 * chosen * diagonal)))
+    chosen = min(max(_NOISES * search.noise_floor(), _LEAST), _MOST)
+    found = FoundHandles(_groups_within(search, chosen), chosen, "")
+    return found._replace(doubt=_doubt(search, found))
 
 
-def _groups_within(
-    search: RigidGroups, tolerance: float, diagonal: float
-) -> tuple[RigidGroup, ...]:
-    groups = search.within(tolerance * diagonal)
+def _groups_within(search: RigidGroups, tolerance: float) -> tuple[RigidGroup, ...]:
+    groups = search.within(tolerance)
     if not groups:
         raise InputError(
             "no handles found: nowhere did a vertex and its neighbors move rigidly within "
-            f"{tolerance * diagonal:.3g} ({tolerance:.3g} of the diagonal); raise the tolerance to "
-            "about four times the noise, or name the handles yourself. Where nothing is rigid, as "
-            "in a face, take each fifteenth vertex or so, with precompute(..., "
+            f"{tolerance * search.mesh.diagonal:.3g} ({tolerance:.3g} of the diagonal); raise the "
+            "tolerance to about four times the noise, or name the handles yourself. Where nothing "
+            "is rigid, as in a face, take each fifteenth vertex or so, with precompute(..., "
             "handle_weights=10.0), for a rough estimate"
         )
     return groups
 
 
-def _doubt(mesh: Mesh, found: FoundHandles, wider: tuple[RigidGroup, ...]) -> str:
+def _doubt(search: RigidGroups, found: FoundHandles) -> str:
     """Say why the noise decides which vertices are handles, or nothing."""
+    mesh, wider = search.mesh, search.within(2 * found.tolerance)
     count, more = (sum(len(x.vertices) for x in groups) for groups in (found.groups, wider))
     said = f"{count} vertices moved rigidly within {found.tolerance:.2g} of the diagonal"
     if more > _MORE * count:

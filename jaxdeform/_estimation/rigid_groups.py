@@ -44,34 +44,35 @@ class RigidGroups:
         i, j = mesh.edges.T
         ones = np.ones(len(i), np.int8)
         half = sp.coo_matrix((ones, (i, j)), (n, n))
-        self._rest, self._poses = mesh.vertices, poses
+        self.mesh, self._poses = mesh, poses
         self._graph = sp.csr_matrix(half + half.T)
         self._rings = _ring_errors(mesh.vertices, poses, self._graph)
 
     def noise_floor(self) -> float:
-        """Return the noise (a length) of the rings that moved most rigidly.
+        """Return the noise (a fraction of the diagonal) of the rings that moved most rigidly.
 
         It is the RMS of a coordinate about a ring's own rigid motion, of the fifth ring from below,
         or on large meshes of one in 200: with six neighbors, one pose and noise alone about 0.55
         times its standard deviation.
         """
         errors = np.sort(self._rings.mean[np.isfinite(self._rings.mean)])
-        return float(errors[min(max(4, len(errors) // 200), len(errors) - 1)])
+        floor = errors[min(max(4, len(errors) // 200), len(errors) - 1)]
+        return float(floor) / self.mesh.diagonal
 
-    def within(self, reach: float) -> tuple[RigidGroup, ...]:
-        """Return the groups whose vertices follow their motion within ``reach``, the largest first.
+    def within(self, tolerance: float) -> tuple[RigidGroup, ...]:
+        """Return the groups that moved rigidly within a fraction of the diagonal, largest first.
 
         A vertex whose whole 1-ring moved rigidly seeds a group. The group grows over neighbors that
         follow its motion, and the motion is fitted again, until neither changes.
         """
-        errors = self._rings.largest
+        errors, reach = self._rings.largest, tolerance * self.mesh.diagonal
         waiting = errors <= reach
         taken = np.zeros(len(errors), bool)
         groups = []
         for seed in np.argsort(errors, kind="stable"):
             if not waiting[seed]:
                 continue
-            group = _grow(self._rest, self._poses, self._graph, seed, reach, ~taken)
+            group = _grow(self.mesh.vertices, self._poses, self._graph, seed, reach, ~taken)
             waiting[seed] = False
             if group is not None:
                 waiting[group.vertices] = False

@@ -30,7 +30,7 @@ def test_handles_are_found_in_noise_and_in_several_poses(bar, bar_problem, pose_
 def test_the_tolerance_follows_from_the_noise(noise):
     """The ends of a rolled plate are two rows of vertices each, which its rest shape shows."""
     rest, pose = real_mesh("plate4SD.ply"), real_mesh("plate4SD_rolledA.ply")
-    groups = jd.find_handle_groups(rest, _noised(rest, pose, noise))
+    groups = jd.find_handle_groups(rest, noisy(rest, pose.vertices, 0, noise))
     along = int(np.argmax(np.ptp(rest.vertices, axis=0)))
     place = rest.vertices[:, along]
     for group in groups:
@@ -45,7 +45,7 @@ def test_the_tolerance_follows_from_the_noise(noise):
 def test_where_noise_hides_the_handles_that_is_said(rest, pose):
     rest, pose = real_mesh(rest), real_mesh(pose)
     with pytest.warns(UserWarning, match="vertices moved rigidly within .* compare the estimates"):
-        jd.find_handles(rest, _noised(rest, pose, 1e-3))
+        jd.find_handles(rest, noisy(rest, pose.vertices, 0, 1e-3))
 
 
 @pytest.mark.parametrize("rigidity", [0.1, 30.0])
@@ -60,11 +60,6 @@ def test_few_handles_of_an_exact_pose_are_found(bar, rigidity):
     np.testing.assert_array_equal(jd.find_handles(bar, pose), np.sort(handles))
 
 
-def _noised(rest: jd.Mesh, pose: jd.Mesh, noise: float) -> np.ndarray:
-    draw = np.random.default_rng(0).standard_normal(pose.vertices.shape)
-    return pose.vertices + noise * rest.diagonal * draw
-
-
 def test_finding_handles_does_not_depend_on_where_the_pose_lies(bar, bar_problem, pose_of):
     moved = np.asarray(jd.rotate(pose_of(1.0), 40.0, axis=[1.0, 2.0, 3.0])) + 7.0
     np.testing.assert_array_equal(jd.find_handles(bar, moved), bar_problem.handles)
@@ -73,5 +68,5 @@ def test_finding_handles_does_not_depend_on_where_the_pose_lies(bar, bar_problem
 @pytest.mark.parametrize("noise", [0.0, 1e-5, 1e-4])
 def test_the_phalanges_of_a_finger_are_found(noise):
     rest, pose = real_mesh("finger0.ply"), real_mesh("finger1.ply")
-    groups = jd.find_handle_groups(rest, _noised(rest, pose, noise))
+    groups = jd.find_handle_groups(rest, noisy(rest, pose.vertices, 0, noise))
     assert [len(group.vertices) > 150 for group in groups] == [True] * 4
