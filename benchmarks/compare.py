@@ -118,7 +118,9 @@ class Child:
         cast(IO[str], self._process.stdout).close()
 
 
-def in_turns(rounds: int, old: Callable[[], Any], new: Callable[[], Any]) -> tuple[list, list]:
+def in_turns(
+    rounds: int, old: Callable[[], Any], new: Callable[[], Any]
+) -> tuple[list[Any], list[Any]]:
     """Return what each answers in each round. Old goes first in even rounds, new in odd ones."""
     olds, news = [], []
     for k in range(rounds):

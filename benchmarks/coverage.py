@@ -88,7 +88,7 @@ class Bar:
         return Draw(truth, fit)
 
 
-def share(hits: Iterable) -> str:
+def share(hits: Iterable[bool]) -> str:
     """Return the share of hits in per cent, with its binomial standard error."""
     values = np.array(list(hits), float)
     p = values.mean()

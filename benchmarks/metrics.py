@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
-Curve = tuple[list, list]
+Curve = tuple[list[float], list[float]]
 """The x and the y values of one line of a picture."""
 
 

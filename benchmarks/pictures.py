@@ -8,8 +8,10 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
+from benchmarks.metrics import Curve
 
-def draw(curves: dict[str, dict[str, tuple[list, list]]], folder: Path) -> list[Path]:
+
+def draw(curves: dict[str, dict[str, Curve]], folder: Path) -> list[Path]:
     """Write a PNG of energy against time and one of time against size, where they were measured."""
     written = []
     loads = [name for name in curves if name != "size"]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -66,7 +67,7 @@ def cluster(count: int, workers: int) -> Iterator[Sample]:
         words = ["batch", manifest, "-o", run, "--workers", str(workers)]
         began = time.perf_counter()
         child = psutil.Popen([PROGRAM, *words], stdout=subprocess.DEVNULL)
-        jobs: list = []
+        jobs: list[Any] = []
         while child.poll() is None:
             time.sleep(2.0)
             root = store.find(str(run))

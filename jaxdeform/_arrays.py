@@ -98,7 +98,7 @@ def float_type(value: ArrayLike) -> np.dtype:
     return np.dtype(jnp.result_type(float))
 
 
-def _leaves(value, name: str) -> list:
+def _leaves(value, name: str) -> list[Any]:
     """Return the entries of nested lists, unless one is odd among them; of anything else none."""
     leaves = list(value) if isinstance(value, list | tuple) else []
     for _ in range(_MOST_AXES):

@@ -77,7 +77,7 @@ def check_setting(name: str, value: object, methods: tuple[str, ...], example: s
         ) from error
 
 
-def read_path(name: str, value: str | os.PathLike | Any) -> Path:
+def read_path(name: str, value: str | os.PathLike[str] | Any) -> Path:
     """Return a path whose name the system can take, or raise InputError."""
     if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
         raise InputError(f"{name} is {a_or_an(value)}: give the name of a file, a str or a Path")
@@ -89,7 +89,7 @@ def read_path(name: str, value: str | os.PathLike | Any) -> Path:
     return Path(value)
 
 
-def check_function(name: str, value: Callable | Any | None, arguments: str) -> None:
+def check_function(name: str, value: Callable[..., Any] | Any | None, arguments: str) -> None:
     """Raise InputError unless the value can be called, or is None."""
     if value is not None and not callable(value):
         raise InputError(f"{name} is {a_or_an(value)}: give a function of ({arguments}), or None")
@@ -138,14 +138,14 @@ def check_precision(name: str, dtype: np.dtype) -> None:
 
 
 def check_positions(
-    name: str, value: ArrayLike, shape: tuple, dtype: np.dtype, unit: str = "vertex"
+    name: str, value: ArrayLike, shape: tuple[int, ...], dtype: np.dtype, unit: str = "vertex"
 ) -> Array:
     """Return a JAX array of this shape, or raise InputError; finite, if its values are known."""
     return jnp.asarray(read_positions(name, value, shape, dtype, unit))
 
 
 def read_positions(
-    name: str, value: ArrayLike, shape: tuple, dtype: np.dtype, unit: str = "vertex"
+    name: str, value: ArrayLike, shape: tuple[int, ...], dtype: np.dtype, unit: str = "vertex"
 ) -> Array | np.ndarray:
     """Like `check_positions`, but without moving NumPy arrays to the device."""
     array = read_array(value, dtype, name)
@@ -160,7 +160,7 @@ def read_positions(
 
 
 def read_host_positions(
-    name: str, value: ArrayLike, shape: tuple, unit: str = "vertex"
+    name: str, value: ArrayLike, shape: tuple[int, ...], unit: str = "vertex"
 ) -> np.ndarray:
     """Like `read_positions`, for code that NumPy runs, in float64."""
     given = read_host_array(value, np.float64, name)

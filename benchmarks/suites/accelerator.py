@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +67,7 @@ def _beside_host(load: str, precision: str, batch: int, repeats: int) -> list[Me
     return out + _agreement(where, ends, APART[precision]) + _faults(where, ours)
 
 
-def _agreement(where: str, ends: list[dict], most: float) -> list[Metric]:
+def _agreement(where: str, ends: list[dict[str, Any]], most: float) -> list[Metric]:
     """Return how far the device's vertices and energy are from the host's."""
     ours, host = (end["vertices"].astype(float) for end in ends)
     diagonal = float(np.linalg.norm(np.ptp(host, axis=0)))

@@ -3,6 +3,7 @@
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ def save_result(
         print(f"jaxdeform: {printable(str(warning.message))}", file=sys.stderr)
 
 
-def as_json(fit: jd.Estimate, handles: np.ndarray) -> dict:
+def as_json(fit: jd.Estimate, handles: np.ndarray) -> dict[str, Any]:
     """Return the content of the report. JSON has no infinity, so null stands for it."""
     finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
     return {

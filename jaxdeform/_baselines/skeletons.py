@@ -45,7 +45,7 @@ class Skeleton:
         return f"Skeleton({len(self.joints)} joints, {len(self.bones)} bones)"
 
 
-def load_skeleton(path: str | os.PathLike) -> Skeleton:
+def load_skeleton(path: str | os.PathLike[str]) -> Skeleton:
     """Read a skeleton from a ``.tgf`` file, a graph as the skinning programs of Jacobson use it.
 
     The file lists the joints as lines ``number x y z``, numbered from 1; then a line ``#``; then

@@ -236,7 +236,7 @@ def _chunks(
         yield _finished(chunk, batch.size, problem.n_vertices)
 
 
-def _read_chunk(problem: Problem, batch: _Batch, members: slice) -> tuple:
+def _read_chunk(problem: Problem, batch: _Batch, members: slice) -> tuple[Any, ...]:
     """Return targets, rigidity and start, as the compiled code takes them."""
     center, dtype, handles = problem.mesh.center, problem.dtype, np.asarray(problem.handles)
 
@@ -268,7 +268,7 @@ def _everywhere(devices: jax.sharding.Mesh, spec: PartitionSpec, arrays: Any) ->
 
 @quick_jit(static=("how", "devices"), options=AS_FAST)
 def _solve_chunk(
-    system: System, soft: Any, own: tuple, how: Settings, devices: jax.sharding.Mesh
+    system: System, soft: Any, own: tuple[Any, ...], how: Settings, devices: jax.sharding.Mesh
 ) -> Solution:
     def some(system, soft, own):
         def one(own):

@@ -80,7 +80,7 @@ class _BoxState(eqx.Module):
     jacobian: Float[Array, "equations unknowns"]
 
 
-class BoxDescent(optx.AbstractDescent):
+class BoxDescent(optx.AbstractDescent[Any, Any, Any]):
     """Minimise the linear model within the bounds and a box of half-width step_size.
 
     Few unknowns: the Jacobian is a matrix.
@@ -166,7 +166,7 @@ def box_least_squares(
     return end.step
 
 
-class RayDescent(optx.AbstractDescent):
+class RayDescent(optx.AbstractDescent[Any, Any, Any]):
     """Go along the Gauss-Newton step, at most step_size in any unknown, clipped to the bounds.
 
     Many unknowns: ``solve`` finds the step from the Jacobian, matrix-free, and the residual.
@@ -200,7 +200,7 @@ class _TrustRegion(NamedTuple):
     """Whether the last evaluation was."""
 
 
-class CappedTrustRegion(optx.AbstractSearch):
+class CappedTrustRegion(optx.AbstractSearch[Any, Any, Any, Any]):
     """optimistix's classical trust region with a largest size, in the maximum norm.
 
     After a rejection it shrinks from the length that was tried. Bounds may have cut that step below
@@ -208,7 +208,7 @@ class CappedTrustRegion(optx.AbstractSearch):
     """
 
     largest: Float[Array, ""]
-    rule: optx.ClassicalTrustRegion
+    rule: optx.ClassicalTrustRegion[Any]
 
     def init(self, y, f_info_struct):
         """Allow the largest step at first."""
@@ -235,7 +235,7 @@ def _silent(**_):
     pass
 
 
-class BoundedGaussNewton(optx.AbstractGaussNewton):
+class BoundedGaussNewton(optx.AbstractGaussNewton[Any, Any, Any]):
     """optimistix's Gauss-Newton with the descents and the search above.
 
     It ends before a step that the linear model expects to gain less than ``rtol`` of the cost, or
@@ -270,7 +270,7 @@ def box_solver(lower: np.ndarray, upper: np.ndarray, values: int = 0) -> Bounded
 
 
 def ray_solver(
-    lower: np.ndarray, upper: np.ndarray, solve: Callable, gain: float
+    lower: np.ndarray, upper: np.ndarray, solve: Callable[..., Any], gain: float
 ) -> BoundedGaussNewton:
     """Return the solver for many unknowns within bounds, for steps that gain that fraction."""
     return _solver(RayDescent(jnp.asarray(lower), jnp.asarray(upper), solve), gain)

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -34,7 +34,7 @@ class HandleFile(NamedTuple):
 
 
 def load_handles(
-    path: str | os.PathLike, mesh: Mesh, motion: str | os.PathLike | None = None
+    path: str | os.PathLike[str], mesh: Mesh, motion: str | os.PathLike[str] | None = None
 ) -> HandleFile:
     """Read handles and their targets from a file.
 
@@ -109,7 +109,7 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(handles), np.concatenate(targets)
 
 
-def _chosen(where: str, group: dict, mesh: Mesh) -> Int[np.ndarray, "chosen"]:
+def _chosen(where: str, group: dict[str, Any], mesh: Mesh) -> Int[np.ndarray, "chosen"]:
     if "where" in group:
         return some_where(mesh, group["where"], f"{where}: where").vertices
     try:
@@ -118,13 +118,13 @@ def _chosen(where: str, group: dict, mesh: Mesh) -> Int[np.ndarray, "chosen"]:
         raise InputError(f"{where}: {error}") from error
 
 
-def _check_keys(where: str, given: dict, *known: str) -> None:
+def _check_keys(where: str, given: dict[str, Any], *known: str) -> None:
     unknown = sorted(set(given) - set(known))
     if unknown:
         raise InputError(f"{where} has the unknown key {shown(unknown[0])}: use {', '.join(known)}")
 
 
-def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
+def _moved(where: str, group: dict[str, Any], points: np.ndarray) -> np.ndarray:
     if "targets" in group:
         if "rotation" in group or "translation" in group:
             raise InputError(f"{where} has targets and a motion: give one of them")
@@ -147,7 +147,7 @@ def _moved(where: str, group: dict, points: np.ndarray) -> np.ndarray:
     return points
 
 
-def _run(where: str, motion: Callable, *arguments, **settings) -> np.ndarray:
+def _run(where: str, motion: Callable[..., Any], *arguments, **settings) -> np.ndarray:
     """Return where the points move to, or raise InputError with the place in the file."""
     try:
         return np.asarray(motion(*arguments, **settings))

@@ -21,7 +21,9 @@ def spread_over_members(size: int, batched: Any, own: Any) -> Any:
     return jax.tree.map(spread, own, batched)
 
 
-def one_by_one(function: Callable, size: int, batched: Any, arguments: tuple) -> tuple[Any, Any]:
+def one_by_one(
+    function: Callable[..., Any], size: int, batched: Any, arguments: tuple[Any, ...]
+) -> tuple[Any, Any]:
     """Run a function on each member in turn: the rule where each has a system of its own.
 
     Side by side the matrices of all would be read in turn anyhow, and all would wait for the

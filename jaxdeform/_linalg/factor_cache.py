@@ -273,7 +273,7 @@ class FactorCache:
         rest = sorted((x for x in rest if x in self._entries), key=lambda x: x not in left_over)
         self._shrink(rest, self.capacity - self._entries[made].size, least=0)
 
-    def _shrink(self, names: list, limit: int, least: int) -> None:
+    def _shrink(self, names: list[Any], limit: int, least: int) -> None:
         total = sum(self._entries[x].size for x in names)
         for name in names[: len(names) - least]:
             if total <= limit:

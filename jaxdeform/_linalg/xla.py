@@ -58,17 +58,17 @@ QUICK = {**AS_FAST, "xla_backend_optimization_level": 1}
 
 def quick_jit(
     static: tuple[str, ...], options: Mapping[str, bool | int] = QUICK
-) -> Callable[[Callable], Callable]:
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator like ``jax.jit``, for programs at top level: they compile sooner.
 
     Where this jaxlib does not know the options, or in another program, they compile as usual.
     """
 
-    def decorate(function: Callable) -> Callable:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         inside = jax.jit(function, static_argnames=static)
 
         @cache
-        def at_top() -> Callable:
+        def at_top() -> Callable[..., Any]:
             known = _known(tuple(options.items()))
             return jax.jit(function, static_argnames=static, compiler_options=known)
 
@@ -82,7 +82,7 @@ def quick_jit(
     return decorate
 
 
-def _is_at_top(arguments: tuple) -> bool:
+def _is_at_top(arguments: tuple[Any, ...]) -> bool:
     """Whether JAX is not tracing: it takes compiler options nowhere else."""
     return is_concrete(arguments, jnp.zeros(()))  # the last is traced inside jit
 

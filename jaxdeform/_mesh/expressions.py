@@ -149,7 +149,7 @@ class _Reader:
     def term(self) -> _Value:
         return self.chain(self.factor, _TERM)
 
-    def chain(self, part: Callable[[], _Value], signs: dict[str, Callable]) -> _Value:
+    def chain(self, part: Callable[[], _Value], signs: dict[str, Callable[..., Any]]) -> _Value:
         value = part()
         while sign := self.take(*signs):
             left, right = self.number(value), self.number(part())

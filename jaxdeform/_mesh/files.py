@@ -28,7 +28,7 @@ from jaxdeform._mesh.writing import check_place, write_atomically
 _MOST_CORNERS = 5_000
 
 
-def load_mesh(path: str | os.PathLike) -> Mesh:
+def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     """Read a mesh from an OBJ, OFF, PLY or STL file.
 
     Polygons with more than three corners are cut into triangles for the work: a quad along its
@@ -64,7 +64,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
 
 def save_mesh(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     mesh: Mesh,
     *,
     vertices: ArrayLike | None = None,
@@ -190,7 +190,7 @@ def _extras(path: Path, suffix: str, source: Source | None) -> Extras:
     return found
 
 
-def load_rigidity(path: str | os.PathLike) -> Float[np.ndarray, "vertices"]:
+def load_rigidity(path: str | os.PathLike[str]) -> Float[np.ndarray, "vertices"]:
     """Read the rigidity per vertex from a PLY file that `save_mesh` wrote.
 
     **Arguments**: path of a ``.ply`` file.
@@ -267,7 +267,7 @@ def format_of(path: Path) -> str:
     return suffix.lower()
 
 
-def check_output(path: str | os.PathLike, mesh: Mesh | None = None) -> None:
+def check_output(path: str | os.PathLike[str], mesh: Mesh | None = None) -> None:
     """Raise InputError if a file, or this mesh at rest, cannot be written under this name.
 
     Example:

@@ -22,7 +22,7 @@ from jaxdeform._mesh.mesh import (
 from jaxdeform._mesh.parsed import Source
 
 # A broken mesh cannot become a Mesh, so the functions below take it in any of three forms.
-MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike
+MeshLike = Mesh | tuple[ArrayLike, ArrayLike] | str | os.PathLike[str]
 
 
 def _arrays(mesh: Any) -> tuple[ArrayLike, ArrayLike, Source | None]:

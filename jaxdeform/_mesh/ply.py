@@ -46,7 +46,9 @@ def vertex_kinds(data: bytes) -> dict[str, str]:
     return {item.name: item.kind for item in properties}
 
 
-def _parse_body(path: Path, data: bytes, header: Header) -> tuple[dict, Polygons, int]:
+def _parse_body(
+    path: Path, data: bytes, header: Header
+) -> tuple[dict[str, np.ndarray], Polygons, int]:
     surface, corners = _surface(path, header)
     vertex = header.vertex
     if header.order:

@@ -31,7 +31,9 @@ class Field(NamedTuple):
         np.frombuffer(data, np.uint8)[places] = content.reshape(places.shape)
 
 
-def binary_fields(path: Path, data: bytes, header: Header) -> tuple[dict, int]:
+def binary_fields(
+    path: Path, data: bytes, header: Header
+) -> tuple[dict[tuple[str, str], Field], int]:
     """Return the fields by (element, property), and where the body ends."""
     at = header.size
     fields: dict[tuple[str, str], Field] = {}

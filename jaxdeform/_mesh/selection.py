@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -107,7 +108,7 @@ class Selection:
     __ror__ = __or__
     __rand__ = __and__
 
-    def _joined(self, other: ArrayLike, join: Callable) -> "Selection":
+    def _joined(self, other: ArrayLike, join: Callable[..., Any]) -> "Selection":
         return Selection(self.mesh, join(self.mask, read_mask("the other side", other, self.mesh)))
 
     def __eq__(self, other: object) -> bool:

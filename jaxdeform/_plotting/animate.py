@@ -24,7 +24,7 @@ _STEP = 6.0
 
 
 def animate(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     mesh: Mesh,
     poses: Sequence[ArrayLike] | ArrayLike,
     *,
@@ -105,7 +105,7 @@ def animate(
     write_film(path, images, int(np.clip(1000 * seconds / len(images), 20, 600_000)))
 
 
-def _read_values(values: Any, poses: list[np.ndarray]) -> list:
+def _read_values(values: Any, poses: list[np.ndarray]) -> list[Any]:
     """Return one array (vertices,) or None per frame."""
     if values is None:
         return [None] * len(poses)

@@ -192,7 +192,7 @@ def read_value(name: str, value: Any, pose: Pose) -> Float[np.ndarray, "vertices
 # ---------------------------------------------------------------- lists and texts
 
 
-def listed(name: str, value: Any, of: str) -> list:
+def listed(name: str, value: Any, of: str) -> list[Any]:
     """Return the entries of a list or an array; text is a list of letters, a dict of keys."""
     array = isinstance(value, np.ndarray | jax.Array) and value.ndim > 0
     if not array and not isinstance(value, list | tuple):

@@ -37,7 +37,7 @@ _MOST_COLUMNS = 5
 
 
 def render(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     mesh: Mesh,
     poses: Sequence[ArrayLike] | ArrayLike,
     *,
@@ -101,7 +101,7 @@ def render(
 
 
 def render_grid(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     mesh: Mesh,
     poses: Sequence[Sequence[ArrayLike]] | ArrayLike,
     rows: Sequence[str],
@@ -161,14 +161,14 @@ def render_grid(
     write_png(path, image)
 
 
-def _table(name: str, value: Any, rows: int) -> list:
+def _table(name: str, value: Any, rows: int) -> list[Any]:
     given = listed(name, value, "rows")
     if len(given) != rows:
         raise InputError(f"{name} has {len(given)} rows, but rows has {rows} texts: give as many")
     return given
 
 
-def _row(name: str, value: Any, columns: int) -> list:
+def _row(name: str, value: Any, columns: int) -> list[Any]:
     given = listed(name, value, "one entry per column")
     if len(given) != columns:
         raise InputError(

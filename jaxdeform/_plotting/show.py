@@ -53,7 +53,7 @@ class Turnable:
     width: int
     height: int
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page into a ``.html`` file; replaced as a whole or not at all.
 
         **Raises** InputError: the name does not end in .html; the folder cannot be written.
@@ -177,7 +177,7 @@ def _page(surface: Surface, poses, paint: Paint, view: View, dots: Dots | None) 
     return page
 
 
-def _over_time(arrays: list, dtype: Any = np.float32) -> Any:
+def _over_time(arrays: list[Any], dtype: Any = np.float32) -> Any:
     """Return one array, or one for each second."""
     typed = [np.asarray(array, dtype) for array in arrays]
     return typed[0] if len(typed) == 1 else {str(k): array for k, array in enumerate(typed)}

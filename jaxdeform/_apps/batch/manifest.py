@@ -41,7 +41,7 @@ class Job(NamedTuple):
     alpha: float | None = None
 
     @property
-    def problem(self) -> tuple:
+    def problem(self) -> tuple[Any, ...]:
         """What jobs of one factor have in common."""
         spokes = Method(self.method).has_spokes
         return self.mesh, self.handles, self.fix, self.move, self.rings, spokes
@@ -238,7 +238,7 @@ def _rotation(value: Any, folder: Path) -> tuple[str, float]:
     return str(words[0]), degrees
 
 
-def _listed(value: Any, mark: str | None) -> list:
+def _listed(value: Any, mark: str | None) -> list[Any]:
     return value.split(mark) if isinstance(value, str) else list(np.atleast_1d(value).tolist())
 
 

@@ -29,10 +29,10 @@ def count(root: Root, jobs: list[Job]) -> Count:
     return Count(int(done.sum()), int((codes == store.FAILED).sum()), len(jobs))
 
 
-def table(root: Root, jobs: list[Job]) -> dict[str, list]:
+def table(root: Root, jobs: list[Job]) -> dict[str, list[Any]]:
     """Return a column for each value of a job, in the order of the manifest."""
     errors = store.errors_of(root)
-    columns: dict[str, list] = {
+    columns: dict[str, list[Any]] = {
         name: [None] * len(jobs)
         for name in ("job", "mesh", "result", "energy", "misfit", "steps", "flipped", "seconds")
     }
@@ -65,7 +65,7 @@ def has_tables(run: str, as_csv: bool) -> bool:
     return all(files.exists(path) for files, path in places)
 
 
-def write_tables(run: str, columns: dict[str, list], as_csv: bool) -> None:
+def write_tables(run: str, columns: dict[str, list[Any]], as_csv: bool) -> None:
     """Write the tables."""
     import fsspec
     import pyarrow

@@ -3,7 +3,7 @@
 import time
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -49,10 +49,10 @@ def _mesh(path: str) -> jd.Mesh:
 
 
 # The last problem, which the next job mostly shares.
-_kept: list = []
+_kept: list[Any] = []
 
 
-def _prepared(key: tuple, job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
+def _prepared(key: tuple[Any, ...], job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
     """Return the mesh, the moves of this job, and the problem, which the last job may have left."""
     mesh = _mesh(job.mesh)
     if job.handles:
