@@ -11,10 +11,13 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.version import Version
 from page_code import run_page
 
 import jaxdeform as jd
@@ -205,6 +208,21 @@ def test_readme_command_line_is_the_real_one():
 def test_citation_has_the_version_of_the_package():
     (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert cited == jd.__version__
+
+
+def test_the_oldest_versions_are_the_lower_bounds():
+    """Else nobody has tried what the bounds promise, or pip refuses to install them."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    lines = (ROOT / "constraints" / "oldest.txt").read_text().splitlines()
+    oldest = dict(line.split("==") for line in lines if "==" in line)
+    for text in [*project["dependencies"], *extras["viewer"], *extras["batch"], *extras["test"]]:
+        needed = Requirement(text)
+        if needed.name == "jaxdeform":
+            continue
+        (least,) = [Version(s.version) for s in needed.specifier if s.operator == ">="]
+        assert needed.name in oldest, f"{text}: constraints/oldest.txt does not name it"
+        assert Version(oldest[needed.name]) == least, text
 
 
 def test_importing_loads_what_is_used_and_no_more():
