@@ -122,6 +122,8 @@ def test_only_public_jax_is_used():
 
 
 def test_no_module_leaks_into_the_public_face():
+    assert jd.select.where
+    assert jd.shapes.bar
     ours = {
         name
         for name, thing in vars(jd).items()

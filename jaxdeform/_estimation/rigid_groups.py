@@ -142,18 +142,48 @@ def _ring_errors(p, poses, graph: sp.csr_matrix) -> _RingErrors:
 
 def _grow(p, poses, graph, seed: int | np.integer, reach: float, allowed) -> RigidGroup | None:
     """Grow a group from the 1-ring of its seed; None if the group loses that ring."""
-    ring = np.append(graph[[seed]].indices, seed)
+    ring = np.append(_neighbors(graph, np.array([seed])), seed)
     members = ring
     for _ in range(_GROWTHS):
         motion = _best_motion(p[members], poses[:, members])
-        follows = np.flatnonzero(allowed & (motion.distances(p, poses) <= reach))
-        if not np.isin(ring, follows).all():
+        grown = _followers(p, poses, graph, seed, members, motion, reach, allowed)
+        if not np.isin(ring, grown).all():
             return None
-        _, label = sp.csgraph.connected_components(graph[follows][:, follows], directed=False)
-        grown = follows[label == label[np.searchsorted(follows, seed)]]
         if np.array_equal(grown, members):
             break
         members = grown
     motion = _best_motion(p[members], poses[:, members])
     error = motion.distances(p[members], poses[:, members]).max()
     return RigidGroup(members, *motion, float(error))
+
+
+def _followers(
+    p, poses, graph, seed: int | np.integer, members, motion: _Motion, reach: float, allowed
+) -> Int[np.ndarray, "followers"]:
+    """Return the vertices that follow the motion and are connected with the seed, ascending.
+
+    From the members outwards, so that a group costs by its own size, not by that of the mesh.
+    """
+    found, seen, front = [], np.zeros(len(p), bool), members
+    while front.size:
+        seen[front] = True
+        follow = allowed[front] & (motion.distances(p[front], poses[:, front]) <= reach)
+        found.append(front[follow])
+        around = np.unique(_neighbors(graph, found[-1]))
+        front = around[~seen[around]]
+    followers = np.sort(np.concatenate(found))
+    if len(found[0]) == len(members):  # connected, as the members were
+        return followers
+    _, label = sp.csgraph.connected_components(graph[followers][:, followers], directed=False)
+    at = np.searchsorted(followers, seed)
+    if at == len(followers) or followers[at] != seed:
+        return followers[:0]
+    return followers[label == label[at]]
+
+
+def _neighbors(graph: sp.csr_matrix, rows: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "neighbors"]:
+    """Return the columns of the rows, one row after the other (a sixth of the time of scipy's)."""
+    first = graph.indptr[rows]
+    count = graph.indptr[rows + 1] - first
+    ends = np.cumsum(count)
+    return graph.indices[np.repeat(first - ends + count, count) + np.arange(count.sum())]

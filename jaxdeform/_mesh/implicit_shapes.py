@@ -138,9 +138,9 @@ def _polygonise(cones: list[Cone], width: float, spacing: float) -> tuple[Points
     corners = np.ravel_multi_index(np.moveaxis(cells[:, None] + _CORNERS, -1, 0), size)
     used, index = np.unique(corners, return_inverse=True)
     grid = low + spacing * np.stack(np.unravel_index(used, size), axis=1)
-    points, faces, _ = igl.marching_cubes(
+    points, faces = igl.marching_cubes(
         field.ravel()[used], np.ascontiguousarray(grid), index.reshape(-1, 8), 0.0
-    )
+    )[:2]  # libigl before 2.6.3 returns no more
     return np.asarray(points), np.asarray(faces).astype(np.int64)
 
 

@@ -221,11 +221,14 @@ def test_ctrl_c_leaves_old_files_whole(files):
         ],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("fixed: ")
-    assert "precomputed" in process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("fixed: ")
+        assert "precomputed" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert err == "jaxdeform: interrupted; no file was left half-written\n"
     assert (files / "out.ply").read_text() == "old"
