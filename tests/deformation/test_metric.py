@@ -117,16 +117,18 @@ def test_it_ends_where_stiffness_ends(bar, bar_problem, bar_targets, kind, rigid
 
 @pytest.mark.filterwarnings("ignore:negative weights:UserWarning")
 @pytest.mark.filterwarnings("ignore:weights of 0 made the system singular:UserWarning")
-@pytest.mark.parametrize("rigidity", [0.0, 1e-2])
-@pytest.mark.parametrize("kind", ["rings", "spokes"])
-def test_obtuse_triangles(kind, rigidity):
+@pytest.mark.parametrize(
+    ("kind", "shear", "rigidity"),
+    [("rings", 0.5, 0.0), ("rings", 0.5, 1e-2), ("spokes", 0.5, 1e-2), ("spokes", 2.0, 0.0)],
+)
+def test_obtuse_triangles(kind, shear, rigidity):
     """Cells of rings keep their negative weights; those of spokes count as 0, and some are flat.
 
     There the metric of rigidity 0 was singular, and led out to 1e74.
     """
-    mesh = _sheet(8, shear=0.5)
+    mesh = _sheet(8, shear=shear)
     cells = jd.rings(mesh, 1) if kind == "rings" else jd.spokes(mesh)
-    handles = jd.select.where(mesh, "v < 0.1 or v > 0.9")
+    handles = jd.select.where(mesh, "y < 0.1 or y > 0.9")
     problem = jd.precompute(mesh, handles, cells=cells)
     assert (problem.cells.weights < 0).any() == (kind == "rings")
     upper = mesh.vertices[problem.handles, 1:2] > 0.5
@@ -136,7 +138,7 @@ def test_obtuse_triangles(kind, rigidity):
         solver = jd.QuasiNewton(tolerance=1e-9, max_steps=2000, metric=choice)
         out = jd.deform(problem, targets, rigidity, solver=solver)
         assert bool(out.ok)
-        assert np.abs(out.vertices).max() < 2.0
+        assert np.abs(out.vertices).max() < 2.0 + shear
         ends[choice] = float(out.energy[-1])
     assert ends["material"] <= ends["stiffness"] * (1 + 1e-6) + 1e-9
 
