@@ -3,7 +3,7 @@
 import json
 import time
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -14,7 +14,7 @@ from jaxdeform._apps.arguments import choose_parts, read_pose
 from jaxdeform._apps.results import as_json, save_result
 from jaxdeform._apps.talk import console, patiently, say_wrote, since
 from jaxdeform._errors import printable
-from jaxdeform._estimation.found_handles import search_handles
+from jaxdeform._estimation.found_handles import FoundHandles, search_handles
 from jaxdeform._estimation.held_out import prediction_errors
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
 from jaxdeform._mesh.writing import check_place, write_atomically
@@ -81,7 +81,8 @@ def estimate(
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
     label = choose_parts(parts, part or [], shape)
     known = jd.load_handles(handles, shape).handles if handles else None
-    index = _moved_rigidly(shape, observed, tolerance) if known is None else known
+    found = _moved_rigidly(shape, observed, tolerance) if known is None else None
+    index = known if found is None else found.vertices
     draw = _Picture(picture, shape, [rest, *poses], observed, index).draw
     draw()
     began = time.perf_counter()
@@ -89,7 +90,7 @@ def estimate(
     problem = patiently("precomputing", lambda: jd.precompute(shape, index, cells=cells))
     fitted, kept = np.split(observed, [len(poses) - hold_out])
     fit = _fit(problem, fitted, label, steps)
-    failed = _saved(out, report, shape, fit, index)
+    failed = _saved(out, report, shape, fit, as_json(fit, index, found))
     console.print(f"{fit.explain()}\nestimated in {since(began)}")
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
@@ -123,7 +124,7 @@ class _Picture(NamedTuple):
 
 
 def _saved(
-    out: Path, report: Path, shape: jd.Mesh, fit: jd.Estimate, handles: np.ndarray
+    out: Path, report: Path, shape: jd.Mesh, fit: jd.Estimate, content: dict[str, Any]
 ) -> jd.InputError | None:
     """Write the field and the report; return why one could not be written.
 
@@ -134,7 +135,7 @@ def _saved(
         save_result(out, shape, None, fit.field)
     except jd.InputError as error:
         failed = error
-    text = _as_text(fit, handles)
+    text = f"{json.dumps(content, indent=1, allow_nan=False)}\n".encode()
     try:
         write_atomically(report, text)
     except jd.InputError as error:
@@ -158,10 +159,6 @@ def _check_hold_out(hold_out: int, count: int) -> None:
         raise jd.InputError(
             f"--hold-out {hold_out} leaves none of the {count} poses to fit: give fewer"
         )
-
-
-def _as_text(fit: jd.Estimate, handles: np.ndarray) -> bytes:
-    return f"{json.dumps(as_json(fit, handles), indent=1, allow_nan=False)}\n".encode()
 
 
 def _check_names(out: Path) -> Path:
@@ -191,7 +188,7 @@ def _report_held_out(
     console.print(table)
 
 
-def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None) -> np.ndarray:
+def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None) -> FoundHandles:
     found = patiently("finding handles", lambda: search_handles(mesh, observed, tolerance))
     sizes = ", ".join(str(len(group.vertices)) for group in found.groups[:10])
     more = ", ..." if len(found.groups) > 10 else ""
@@ -205,7 +202,7 @@ def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None)
             f"the estimate depends on that: {found.doubt}. Compare another --tolerance, or give "
             "--handles"
         )
-    return found.vertices
+    return found
 
 
 def _show_evaluation(evaluation: int, misfit: float, rigidity: np.ndarray) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 import jaxdeform as jd
 from jaxdeform._errors import printable
+from jaxdeform._estimation.found_handles import FoundHandles
 from jaxdeform._mesh.files import without_suffix
 
 
@@ -31,8 +32,13 @@ def save_result(
         print(f"jaxdeform: {printable(str(warning.message))}", file=sys.stderr)
 
 
-def as_json(fit: jd.Estimate, handles: np.ndarray) -> dict[str, Any]:
-    """Return the content of the report. JSON has no infinity, so null stands for it."""
+def as_json(
+    fit: jd.Estimate, handles: np.ndarray, found: FoundHandles | None = None
+) -> dict[str, Any]:
+    """Return the content of the report. JSON has no infinity, so null stands for it.
+
+    ``found`` says by which tolerance the handles were found, unless they were given.
+    """
     finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
     return {
         "parts": [
@@ -56,4 +62,5 @@ def as_json(fit: jd.Estimate, handles: np.ndarray) -> dict[str, Any]:
         "history": list(map(finite, fit.history)),
         "result": {"ok": fit.ok, "sentence": jd.Result[fit.result]},
         "handles": handles.tolist(),
+        "found": {"tolerance": found.tolerance, "doubt": found.doubt} if found else None,
     }

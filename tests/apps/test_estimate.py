@@ -190,6 +190,7 @@ def test_an_estimate_is_told_though_it_cannot_be_written(run, files, bar, monkey
     start = out.index("\n{\n") + 1
     report, end = json.JSONDecoder().raw_decode(out[start:])
     assert len(report["parts"]) == 1
+    assert report["found"] == {"tolerance": 1e-6, "doubt": ""}
     assert "estimated in" in out[start + end :]
     assert "wrote" not in out
     # Where only the name cannot be written, the field is beside it.
