@@ -80,9 +80,7 @@ def estimate(
     report = _check_names(out)
     observed = np.stack([read_pose(path, shape, rest) for path in poses])
     label = choose_parts(parts, part or [], shape)
-    known = jd.load_handles(handles, shape).handles if handles else None
-    found = _moved_rigidly(shape, observed, tolerance) if known is None else None
-    index = known if found is None else found.vertices
+    index, found = _handles(handles, shape, observed, tolerance)
     draw = _Picture(picture, shape, [rest, *poses], observed, index).draw
     draw()
     began = time.perf_counter()
@@ -186,6 +184,15 @@ def _report_held_out(
     for name, mine, rigid in zip(names, ours, arap, strict=True):
         table.add_row(printable(name.name), f"{100 * mine:.3g}", f"{100 * rigid:.3g}")
     console.print(table)
+
+
+def _handles(
+    path: Path | None, mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None
+) -> tuple[np.ndarray, FoundHandles | None]:
+    if path:
+        return jd.load_handles(path, mesh).handles, None
+    found = _moved_rigidly(mesh, observed, tolerance)
+    return found.vertices, found
 
 
 def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None) -> FoundHandles:
