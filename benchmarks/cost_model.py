@@ -23,14 +23,14 @@ class Size(NamedTuple):
 
     vertices: int
     rings: int = 1
-    lanes: int = 1
+    members: int = 1
 
 
 FITTED = (
     *(Size(n) for n in (1_000, 3_000, 9_000, 27_000, 80_000, 240_000)),
     *(Size(n, rings) for n in (3_000, 27_000) for rings in (2, 4)),
-    *(Size(1_000, 1, lanes) for lanes in (4, 64)),
-    *(Size(9_000, 1, lanes) for lanes in (4, 16)),
+    *(Size(1_000, 1, members) for members in (4, 64)),
+    *(Size(9_000, 1, members) for members in (4, 16)),
 )
 CHECKED = (
     Size(5_000), Size(50_000), Size(150_000), Size(10_000, 3), Size(5_000, 1, 8), Size(2_000, 1, 32)
@@ -41,9 +41,9 @@ Row = Mapping[str, float]
 
 
 def _work(row: Row) -> tuple[float, float, float]:
-    """Return the vertices of the arrays, the entries of their cells, and the lanes."""
+    """Return the vertices of the arrays, the entries of their cells, and the members."""
     n = bucket(int(row["vertices"]))
-    return n, n * row["cell"], row["lanes"]
+    return n, n * row["cell"], row["members"]
 
 
 def _terms_of_precompute(row: Row) -> dict[str, float]:
@@ -52,18 +52,18 @@ def _terms_of_precompute(row: Row) -> dict[str, float]:
 
 
 def _terms_of_step(row: Row) -> dict[str, float]:
-    n, entries, lanes = _work(row)
+    n, entries, members = _work(row)
     return {
         "1": 1.0,
-        "n l": n * lanes,
-        "n l log n": n * lanes * np.log2(n),
-        "n l k": entries * lanes,
+        "n l": n * members,
+        "n l log n": n * members * np.log2(n),
+        "n l k": entries * members,
     }
 
 
 def _terms_of_peak(row: Row) -> dict[str, float]:
-    n, entries, lanes = _work(row)
-    return {"1": 1.0, "n": n, "n log n": n * np.log2(n), "n k": entries, "n l": n * lanes}
+    n, entries, members = _work(row)
+    return {"1": 1.0, "n": n, "n log n": n * np.log2(n), "n k": entries, "n l": n * members}
 
 
 QUANTITIES: dict[str, Callable[[Row], dict[str, float]]] = {
@@ -71,7 +71,7 @@ QUANTITIES: dict[str, Callable[[Row], dict[str, float]]] = {
     "step": _terms_of_step,
     "peak": _terms_of_peak,
 }
-"""Seconds of `precompute`, seconds of a quasi-Newton step of all lanes, peak memory in GiB."""
+"""Seconds of `precompute`, seconds of a quasi-Newton step of all members, peak memory in GiB."""
 
 Model = dict[str, dict[str, float]]
 
@@ -101,11 +101,11 @@ def predict(model: Model, name: str, row: Row) -> float:
 def as_table(model: Model, rows: list[Row]) -> str:
     """Return measured values, and by how many per cent the model misses them."""
     lines = [
-        "| vertices | k | lanes | precompute, s | model | step, ms | model | peak, GiB | model |",
+        "| vertices | k | members | precompute, s | model | step, ms | model | peak, GiB | model |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        cells = [f"{row['vertices']:,.0f}", f"{row['cell']:.1f}", f"{row['lanes']:.0f}"]
+        cells = [f"{row['vertices']:,.0f}", f"{row['cell']:.1f}", f"{row['members']:.0f}"]
         for name, unit in (("precompute", 1.0), ("step", 1e3), ("peak", 1.0)):
             off = predict(model, name, row) / row[name] - 1
             cells += [f"{row[name] * unit:.3g}", f"{100 * off:+.0f} %"]

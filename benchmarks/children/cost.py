@@ -20,10 +20,10 @@ from benchmarks import harness, workloads  # noqa: E402
 STEPS = 10
 REPEATS = 3
 WHOLE = 2**40
-"""Memory, in bytes, that takes all lanes in one chunk."""
+"""Memory, in bytes, that takes all members in one chunk."""
 
 
-def main(vertices: int, rings: int, lanes: int) -> dict[str, float]:
+def main(vertices: int, rings: int, members: int) -> dict[str, float]:
     load = workloads.tube(vertices)
     seconds = []
     for turn in range(REPEATS):  # of another size each time, because factors are kept by content
@@ -31,7 +31,7 @@ def main(vertices: int, rings: int, lanes: int) -> dict[str, float]:
         began = time.perf_counter()
         problem = jd.precompute(mesh, load.handles, cells=jd.rings(mesh, rings))
         seconds.append(time.perf_counter() - began)
-    rigidity = float(np.mean(workloads.material(problem))) * np.geomspace(0.5, 2.0, lanes)
+    rigidity = float(np.mean(workloads.material(problem))) * np.geomspace(0.5, 2.0, members)
     solver = jd.QuasiNewton(max_steps=STEPS, tolerance=0.0, leave_saddles=False)
 
     def run():
@@ -47,7 +47,7 @@ def main(vertices: int, rings: int, lanes: int) -> dict[str, float]:
     return {
         "vertices": mesh.n_vertices,
         "cell": problem.own_cells.membership.nnz / mesh.n_vertices,
-        "lanes": lanes,
+        "members": members,
         "precompute": min(seconds),
         "step": min(times) / STEPS,
         "peak": harness.peak_gib(),

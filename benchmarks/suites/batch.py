@@ -30,7 +30,7 @@ def run(quick: bool) -> Findings:
         )
         kind = f"batch of 64, {type(solver).__name__}"
         ratio = (seconds["many"] / 64) / (seconds["one"] / 8)
-        out.append(Metric(f"{kind}, time per lane / single", load.name, ratio, "1", 0.7))
+        out.append(Metric(f"{kind}, time per member / single", load.name, ratio, "1", 0.7))
         label, rate = f"deformations a second, {kind}", 64 / seconds["many"]
         out.append(Metric(label, load.name, rate, "/s", more_is_better=True))
     return Findings(out)

@@ -229,11 +229,12 @@ def check_problem(problem: Any) -> None:
 
 
 def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:
-    """Turn a scale-free, resolution-free material constant into the rigidity of each vertex.
+    """Turn a scale-free material constant into the rigidity of each vertex.
 
     ``lambda_k = constant * tr(B_k) / 2``. The sum of w |e|^2 over a triangle's edges is twice its
-    area, so tr(B_k) / 2 measures the area of the cell. The same constant is the same material on a
-    rescaled or refined mesh; the same lambda is not.
+    area, so tr(B_k) / 2 measures the area of the cell. The same constant resists stretch alike on a
+    rescaled or refined mesh; the same lambda does not. Bending still depends on resolution: a sheet
+    bends as if it were as thick as its cells are wide.
 
     **Arguments**: problem; constant >= 0, a number or (vertices,), without unit.
 

@@ -133,11 +133,11 @@ def test_batches_and_a_frame_that_fails(bar, bar_problem):
 
     out = batch(np.stack([steps, steps, broken]), rigidity)
     assert out.vertices.shape == (3, 3, 722, 3)
-    for lane, k in np.ndindex(2, 3):
+    for member, k in np.ndindex(2, 3):
         # Up to here a bend has one minimum, so that any start finds it (to 1e-8 of its energy).
-        alone = jd.deform(bar_problem, steps[k], rigidity[lane])
-        np.testing.assert_allclose(out.energy[lane, k, -1], alone.energy[-1], rtol=1e-6)
-        np.testing.assert_allclose(out.vertices[lane, k], alone.vertices, atol=3e-2)
+        alone = jd.deform(bar_problem, steps[k], rigidity[member])
+        np.testing.assert_allclose(out.energy[member, k, -1], alone.energy[-1], rtol=1e-6)
+        np.testing.assert_allclose(out.vertices[member, k], alone.vertices, atol=3e-2)
     assert out.ok.tolist() == [[True] * 3, [True] * 3, [True, False, True]]
     assert bool((out.result == jd.Result.bad_input)[2, 1])
     assert not np.isfinite(out.vertices[2, 1]).all()
