@@ -1,6 +1,5 @@
 """Algebra of 3x3 and 9x9 matrices by components, over all cells at once."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -63,21 +62,18 @@ def inverse_of_symmetric(
 
     A pivot below ``floor`` (a direction without stiffness) is replaced by ``floor``.
 
-    An L D L^T factor, unrolled into components, is made three times as fast, but compiles for 2.7
-    instead of 0.6 s, and its solve takes 13 instead of 3 ms (9x9 matrices of 50,000 cells). A
-    derivative solves some 50 times.
+    The loop is unrolled: 3 instead of 9 ms (4,864 cells; 52 instead of 105 for 50,000), and 0.4
+    instead of 0.15 s to compile. An L D L^T factor, unrolled into components, is made as fast, but
+    compiles for 2.7 s, and its solve takes 13 instead of 3 ms (50,000 cells). A derivative solves
+    some 50 times.
     """
     unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-
-    def eliminate(k, a):
+    for k, e in enumerate(unit[:, :, None]):
         # In the pivot's row and column too: a - (column - e)(row + e) / pivot, e the unit vector.
-        pick = lambda axis: jax.lax.dynamic_index_in_dim(a, k, axis, keepdims=False)  # noqa: E731
-        row, column, e = pick(0), pick(1), unit[k][:, None]
-        pivot = jax.lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-        pivot = jnp.where(jnp.abs(pivot) > floor, pivot, floor)
-        return a - (column - e)[:, None] * ((row + e) / pivot[None])[None]
-
-    return jax.lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
+        row, column = matrix[k], matrix[:, k]
+        pivot = jnp.where(jnp.abs(row[k]) > floor, row[k], floor)
+        matrix = matrix - (column - e)[:, None] * ((row + e) / pivot[None])[None]
+    return matrix
 
 
 def times_vectors(
