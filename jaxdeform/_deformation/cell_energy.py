@@ -6,8 +6,9 @@ The sum over all cells is Eq. 4.4: E(p', T) = tr(p'^T A p') + sum_k phi_k(T_k),
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from jaxdeform._linalg.block_factor import Blocks
 from jaxdeform._linalg.small_matrices import (
     Grid,
     Matrices,
@@ -52,19 +53,26 @@ def half_gradient(x: Grid, m: Grid, b: list[Array], lam: Array) -> Grid:
     return [[g[i][j] - m[j][i] for j in range(3)] for i in range(3)]
 
 
-def half_hessian(t: Matrices, b: Vectors, lam: Scalars) -> Float[Array, "9 9 cells"]:
-    """Half the Hessian of phi at T, as a matrix: what `half_hessian_product` multiplies with."""
-    # Axes i, j, k, l, cell. (einsum would do it by batched products of 3x3 matrices, slowly.)
+def half_hessian(t: Matrices, b: Vectors, lam: Scalars) -> Blocks:
+    """Half the Hessian of phi at T, as a matrix: what `half_hessian_product` multiplies with.
+
+    Its blocks are those of the rows of T.
+    """
     unit = jnp.eye(3, dtype=t.dtype)[..., None]
-    gram = jnp.sum(t[:, :, None] * t[:, None], axis=0)
-    outer = jnp.sum(t[:, None] * t[None], axis=2)
-    strain = (
-        unit[:, None, :, None] * (gram - unit)[None, :, None]
-        + outer[:, None, :, None] * unit[None, :, None]
-        + t[:, None, None] * jnp.swapaxes(t, 0, 1)[None, :, :, None]
+    gram = sum(t[k, :, None] * t[k, None] for k in (1, 2)) + t[0, :, None] * t[0, None]
+    twice = 2.0 * lam[None, None]
+
+    def block(i: int, k: int) -> Matrices:
+        strain = _dot(t[i], t[k])[None, None] * unit + t[k, :, None] * t[i, None]
+        if i != k:
+            return twice * strain
+        return twice * (strain + gram - unit) + unit * b[None]
+
+    return (
+        (block(0, 0),),
+        (block(1, 0), block(1, 1)),
+        (block(2, 0), block(2, 1), block(2, 2)),
     )
-    data = unit[:, None, :, None] * unit[None, :, None] * b[None, :, None, None]
-    return (2.0 * lam[None, None, None, None] * strain + data).reshape(9, 9, -1)
 
 
 def half_hessian_product(x: Grid, b: list[Array], lam: Array, v: Grid) -> Grid:

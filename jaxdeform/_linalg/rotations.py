@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.small_matrices import (
     Grid,
     Matrices,
@@ -109,16 +110,16 @@ def _rotation_jvp(primals, tangents):
     """``dR = R [w]x`` with ``(tr(M) I - M) w = axial(N - N^T)``, M = C R, N = R^T dC^T."""
     rotation, c = primals
     fixed = jax.lax.stop_gradient((rotation, c))
+
+    def turned(rotation: Matrices, c: Matrices) -> Matrices:
+        lean = _axial(product(transpose(as_grid(rotation)), transpose(as_grid(c))))
+        return rotation + from_grid(_turn(*fixed, lean))
+
     rotation = rotation_with_derivative(rotation, c)  # so that the rule itself has derivatives
     # A turn of size 0 that has the derivatives of R by itself: reverse mode through a scan takes R
     # for a constant (JAX drops the rule of what it knows), and a second derivative must not.
-    r = as_grid(rotation)
-    lean = _axial(product(transpose(r), transpose(as_grid(c))))
-    lean = [x - jax.lax.stop_gradient(x) for x in lean]
-    turn = _turn(*fixed, lean)
-    r = [[r[i][j] + turn[i][j] for j in range(3)] for i in range(3)]
-    rotation = from_grid(r)
-    lean = _axial(product(transpose(r), transpose(as_grid(tangents[1]))))
+    rotation = with_derivative_of(turned, rotation, rotation, c)
+    lean = _axial(product(transpose(as_grid(rotation)), transpose(as_grid(tangents[1]))))
     return rotation, from_grid(_turn(rotation, c, lean))
 
 

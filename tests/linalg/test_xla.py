@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdeform._deformation.material_derivative import material_with_derivative
 from jaxdeform._linalg.xla import after_reads, total, without_fusion
 
 
@@ -114,3 +115,13 @@ def test_after_reads_refuses_what_is_not_finite():
     reads = jnp.array([1.0, jnp.nan, jnp.inf, 2.0])
     condition = jnp.array([True, True, True, False])
     np.testing.assert_array_equal(after_reads(condition, reads), [True, False, False, False])
+
+
+def test_the_solution_of_the_cells_is_worked_out_once():
+    """It is read by the derivatives to C, b and lambda."""
+    unit, ones = jnp.tile(jnp.eye(3)[..., None], 5), jnp.ones((3, 5))
+
+    def pull_back(t, *at):
+        return jax.vjp(lambda *x: material_with_derivative(t, *x), *at)[1](t)
+
+    assert computations_with(compiled(pull_back, unit, unit, ones, ones[0]), "conditional")
