@@ -52,6 +52,7 @@ from ._estimation.verdict import Verdict
 from ._handles.files import HandleFile, load_handles
 from ._handles.rigid import rigid_targets
 from ._handles.targets import bend, rotate, translate, twist
+from ._linalg.known_value import with_derivative_of
 from ._mesh import select, shapes
 from ._mesh.cells import Cells, rings, spokes
 from ._mesh.files import load_mesh, load_rigidity, save_mesh
@@ -153,4 +154,5 @@ __all__ = [
     "submesh",
     "translate",
     "twist",
+    "with_derivative_of",
 ]

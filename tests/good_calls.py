@@ -22,12 +22,12 @@ SKIN = {
 }
 WEIGHTS = {"vertices": MESH.vertices, "controls": TWO, "distances": np.ones((N, 2))}
 
-# Results and protocols, which a user does not make; and what sets the whole process
-# (apps/test_compilation_cache.py).
+# Results and protocols, which a user does not make; what sets the whole process
+# (apps/test_compilation_cache.py); and what takes a function (linalg/test_known_value.py).
 _NOT_CALLED = (
     "Adjoint Cells CoarseProblem Discrepancy Estimate FieldEstimate HandleFile InputError "
     "Inspection LocalStep Problem Result RigidGroup Selection Skeleton Solution Solver "
-    "ThesisEstimate Turnable Verdict enable_compilation_cache"
+    "ThesisEstimate Turnable Verdict enable_compilation_cache with_derivative_of"
 )
 NOT_CALLED = set(_NOT_CALLED.split())
 NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}

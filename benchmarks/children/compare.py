@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 began = time.perf_counter()
 
@@ -76,7 +77,11 @@ def descent(load: Load, rigidity: float) -> Job:
     out = jd.deform(problem, load.targets, rigidity, solver=exact, start=load.start)
     energy = np.asarray(out.energy)[: int(out.steps) + 1]
     steps = int(np.flatnonzero(energy <= energy.min() * (1 + NEAR))[0])
-    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0, leave_saddles=False)
+    # An older version has no such search, and no name for it.
+    to_the_end: dict[str, Any] = (
+        {"leave_saddles": False} if hasattr(jd.QuasiNewton, "leave_saddles") else {}
+    )
+    solver = jd.QuasiNewton(max_steps=steps, tolerance=0.0, **to_the_end)
     note = f"{steps} steps, minimum {energy.min():.6g}"
     return lambda: jd.deform(problem, load.targets, rigidity, solver=solver, start=load.start), note
 

@@ -83,7 +83,7 @@ def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     try:
         values = np.asarray(real(text.encode(errors="replace")))
     except ValueError:
-        if not Path(text).exists():
+        if not _exists(text):
             raise jd.InputError(
                 f"--rigidity {text}: is neither a number nor a file: give a number or a PLY file"
             ) from None
@@ -93,6 +93,13 @@ def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     except jd.InputError as error:
         raise jd.InputError(f"--rigidity {text}: {error}") from error
     return values
+
+
+def _exists(name: str) -> bool:
+    try:
+        return Path(name).exists()
+    except OSError:  # a name that no file can have
+        return False
 
 
 def make_folder(folder: Path) -> None:

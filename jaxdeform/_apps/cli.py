@@ -22,7 +22,7 @@ from jaxdeform._apps.batch.command import batch
 from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.estimating import estimate
 from jaxdeform._apps.mouth import open_closed_outputs
-from jaxdeform._apps.talk import console, mouth, patiently, since
+from jaxdeform._apps.talk import complain, console, mouth, patiently, since
 from jaxdeform._plotting.files import check_picture_path
 
 app = typer.Typer(
@@ -75,9 +75,9 @@ def main() -> None:
             _tell_failure()
         raise
     except jd.InputError as error:
-        print(f"jaxdeform: {error}", file=sys.stderr)
+        complain(f"jaxdeform: {error}")
         for note in getattr(error, "__notes__", []):  # where an expression is wrong
-            print(note, file=sys.stderr)
+            complain(note)
         sys.exit(2)
     except OSError as error:  # typer's own texts, such as --help
         if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EIO):
@@ -85,8 +85,7 @@ def main() -> None:
         mouth.fail(error)
         _tell_failure()
     except _Interrupted:
-        print("jaxdeform: interrupted; no file was left half-written", file=sys.stderr)
-        sys.stderr.flush()
+        complain("jaxdeform: interrupted; no file was left half-written")
         os._exit(130)  # do not wait for the worker thread
     finally:
         signal.signal(signal.SIGINT, before)
@@ -101,7 +100,7 @@ def _tell_failure() -> None:
     """Say that the words about the work are lost, unless nobody wanted them."""
     if mouth.failure and mouth.failure.errno != errno.EPIPE:
         reason = mouth.failure.strerror
-        print(f"jaxdeform: standard output cannot be written ({reason})", file=sys.stderr)
+        complain(f"jaxdeform: standard output cannot be written ({reason})")
         sys.exit(1)
 
 
@@ -135,7 +134,7 @@ def demo(
             f"{float(solution.energy[-1]):.4g}",
             str(int(solution.steps)),
             since(began),
-            jd.Result[solution.result],
+            solution.explain(),
         )
         poses.append(np.asarray(solution.vertices))
         jd.save_mesh(out / f"{name}.ply", mesh, vertices=poses[-1], rigidity=rigidity)

@@ -229,7 +229,7 @@ def _deformed(
     if frames is None:
         one = patiently("deforming", lambda: settings.deform(problem, moves.targets, values))
         energy, done = float(one.energy[-1]), int(one.steps)
-        words = [f"energy {energy:.6g} after {done} steps in {since(began)}", jd.Result[one.result]]
+        words = [f"energy {energy:.6g} after {done} steps in {since(began)}", one.explain()]
         return _Result(np.asarray(one.vertices)[None], shown, words)
     path = moves.path(frames)
     run = lambda tell: settings.deform_path(problem, path, values, tell)  # noqa: E731

@@ -1,6 +1,5 @@
 """What the command line writes: meshes and reports."""
 
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import jaxdeform as jd
+from jaxdeform._apps.talk import complain
 from jaxdeform._errors import printable
 from jaxdeform._estimation.found_handles import FoundHandles
 from jaxdeform._mesh.files import without_suffix
@@ -29,7 +29,7 @@ def save_result(
                 raise error from None
             raise jd.InputError(f"{error}; the result is in {rescue}") from error
     for warning in caught:
-        print(f"jaxdeform: {printable(str(warning.message))}", file=sys.stderr)
+        complain(f"jaxdeform: {printable(str(warning.message))}")
 
 
 def as_json(

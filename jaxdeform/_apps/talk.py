@@ -1,5 +1,7 @@
 """What a command says while it works."""
 
+import contextlib
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +28,12 @@ mouth = Mouth()
 console = Console(file=cast(TextIO, mouth), highlight=False, markup=False, soft_wrap=True)
 
 Out = TypeVar("Out")
+
+
+def complain(text: str) -> None:
+    """Write a line to standard error. Where nobody takes it, it is lost, and the work goes on."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def patiently(what: str, work: Callable[[], Out]) -> Out:

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import check_positions, rows_of_three
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._handles.targets import check_angle
 from jaxdeform._linalg.rotations import (
     matrices_from_quaternions,
     quaternion_product,
@@ -29,7 +30,8 @@ def rigid_transforms(
 
     **Returns** (controls, 3, 4): rotation and shift.
 
-    **Raises** InputError: shapes that differ; values that are not finite.
+    **Raises** InputError: shapes that differ; values that are not finite; angles so large that
+    rounding leaves nothing of them; motions that overflow.
 
     Example:
         >>> import jaxdeform as jd, numpy as np
@@ -42,11 +44,18 @@ def rigid_transforms(
     shape = rotations.shape
     translations = check_positions("translations", translations, shape, dtype, unit="control")
     centers = check_positions("centers", centers, shape, dtype, unit="control")
-    matrices = rotation_matrices(rotations)
-    shift = (
-        centers + translations - jnp.einsum("mij,mj->mi", matrices, centers, precision="highest")
-    )
-    return jnp.concatenate([matrices, shift[:, :, None]], axis=2)
+    if is_concrete(rotations):
+        with np.errstate(over="ignore"):
+            angles = np.degrees(np.linalg.norm(rotations, axis=1))
+        check_angle("rotations turn by", angles.max(initial=0.0))
+    turned = rotation_matrices(rotations)
+    shift = centers + translations
+    shift = shift - jnp.einsum("mij,mj->mi", turned, centers, precision="highest")
+    if is_concrete(shift) and not np.isfinite(shift).all():
+        raise InputError(
+            "translations and centers overflow: give smaller ones, or another unit of length"
+        )
+    return jnp.concatenate([turned, shift[:, :, None]], axis=2)
 
 
 def linear_blend_skinning(

@@ -22,6 +22,7 @@ from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.lbfgs import SLOTS
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import check_result
 
@@ -292,4 +293,4 @@ def _finished(chunk: tuple[int, Solution], size: int, count: int) -> tuple[slice
         out = jax.tree.map(partial(multihost_utils.process_allgather, tiled=True), out)
     last = min(first + len(out.steps), size)
     out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), out)
-    return slice(first, last), jax.block_until_ready(cut_to_mesh(out, count))
+    return slice(first, last), settled(cut_to_mesh(out, count))

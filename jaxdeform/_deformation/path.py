@@ -24,6 +24,7 @@ from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import Solution, cut_to_mesh, descend, guess, without_derivative
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.waiting import settled
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, check_result
 
@@ -195,7 +196,7 @@ def _follow_slowly(
     done = []
     for k in range(frames):
         one = inputs._replace(targets=inputs.targets[k : k + 1])
-        last, out = jax.block_until_ready(_follow(system, one, last, how))
+        last, out = settled(_follow(system, one, last, how))
         done.append(out)
         progress(k + 1, frames)
     return jax.tree.map(lambda *x: jnp.concatenate(x), *done)

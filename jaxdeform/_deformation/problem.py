@@ -11,9 +11,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
 
+from jaxdeform._arrays import is_concrete
 from jaxdeform._checks import check_precision, check_rigidity, check_type
 from jaxdeform._deformation.covariance import stiffness
-from jaxdeform._deformation.system import System, build_system
+from jaxdeform._deformation.system import System, build_system, fingerprint
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._handles.split import HandleSplit, split_handles
 from jaxdeform._linalg.buckets import bucket, cut, enlarge, fill_up
@@ -218,13 +219,19 @@ def _factorise(
 
 
 def check_problem(problem: Any) -> None:
-    """Raise InputError unless this is a problem, of a type that JAX can compute in now."""
+    """Raise InputError unless this is a problem, of one mesh, that JAX can compute with now."""
     check_type("problem", problem, Problem)
     check_precision("problem", problem.dtype)
     if problem.system.rest.ndim > 2:
         raise InputError(
             "problem: a stack of problems, which jax.vmap takes apart: call "
             "jax.vmap(lambda problem, targets: jd.deform(problem, targets, ...))(stack, targets)"
+        )
+    own, cells = problem.system.fingerprint, problem.cells
+    if cells is not None and is_concrete(own) and not np.array_equal(own, fingerprint(cells)):
+        raise InputError(
+            "problem: its arrays are of another mesh, or of other cells, than its cells: read a "
+            "file of arrays into what precompute makes of the same mesh, handles and cells"
         )
 
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_blocks
 from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
@@ -43,6 +43,8 @@ class System(eqx.Module):
     """A, with the weights of the soft handles on its diagonal."""
     factor: Factor
     initial_guess: LaplacianGuess
+    fingerprint: UInt32[Array, "2"]
+    """Of the cells and their mesh, which stand beside these arrays and may come from elsewhere."""
     faces: Int[Array, "faces 3"]
     sides: Float[Array, "faces 3"] | None
     """-1 where a face is turned over as seen from a corner; None stands for 1 everywhere."""
@@ -82,9 +84,15 @@ def build_system(
         stiffness=EllMatrix.build([[matrix]], dtype),
         factor=factor,
         initial_guess=laplacian_guess(cells, led, dtype),
+        fingerprint=jax.device_put(fingerprint(cells)),
         faces=jax.device_put(faces),
         sides=None if sides is None else put(sides),
     )
+
+
+def fingerprint(cells: Cells) -> UInt32[np.ndarray, "2"]:
+    """Return what tells these cells from others, of this mesh or another."""
+    return np.frombuffer(cells.digest[:8], np.uint32)
 
 
 def _filled_up_faces(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -17,6 +17,7 @@ from jaxdeform._mesh.ply import vertex_columns, vertex_kinds
 from jaxdeform._mesh.ply_header import parse_header
 from jaxdeform._mesh.ply_texture import corner_texture as ply_texture
 from jaxdeform._mesh.reading import without_mark
+from jaxdeform._mesh.words import real
 
 # What every format holds, or is made anew, or goes along into a PLY.
 _PLY_KNOWN = {
@@ -84,7 +85,7 @@ def _off_colors(data: bytes) -> _Colors | None:
 
 def _numbers(words: list[list[bytes]]) -> np.ndarray | None:
     try:
-        return np.array([[float(word) for word in row] for row in words])
+        return np.array([[real(word) for word in row] for row in words])
     except ValueError:  # no numbers, or not in every row: then it is something else
         return None
 

@@ -19,6 +19,7 @@ from jaxdeform._mesh.words import (
     excerpt,
     joined,
     position,
+    real,
     stacked,
     text_of,
     whole,
@@ -219,7 +220,7 @@ def corner_texture(data: bytes, polygons: Polygons) -> Float[np.ndarray, "corner
         if keyword == b"vt"
     ]
     try:
-        pairs = np.array([[float(word) for word in (*row, b"0")[:2]] for row in words])
+        pairs = np.array([[real(word) for word in (*row, b"0")[:2]] for row in words])
     except ValueError:
         return None
     if not len(pairs) or pairs.shape[1:] != (2,) or len(named) != len(polygons.corners):

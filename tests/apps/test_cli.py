@@ -1,5 +1,6 @@
 """The command line."""
 
+import dataclasses
 import json
 import os
 import shlex
@@ -107,6 +108,7 @@ MISTAKES = {
     "--rigidity nan: rigidity is nan: it must be": {"--rigidity": "nan"},
     "--rigidity -1: rigidity is -1.0": {"--rigidity": "-1"},
     "inf": {"--rigidity": "inf"},
+    "--rigidity aaaa": {"--rigidity": 300 * "a"},
     "short.ply: rigidity has shape (9,): give one number": {"--rigidity": "{}/short.ply"},
     "plain.ply: its vertices have no property 'rigidity'": {"--rigidity": "{}/plain.ply"},
     "bar.off: rigidity is kept in .ply files only": {"--rigidity": "{}/bar.off"},
@@ -235,8 +237,11 @@ def test_ctrl_c_leaves_old_files_whole(files):
     assert sorted(os.listdir(files)) == before
 
 
-def spoken_to(files, target, *arguments):
-    """Run the command with its output closed or on a full disk: exit code and errors."""
+def spoken_to(files, target, *arguments, errors=subprocess.PIPE):
+    """Run the command with its output closed or on a full disk: exit code and errors.
+
+    With ``errors=subprocess.STDOUT`` the errors go where the output goes.
+    """
     command = [Path(sys.executable).parent / "jaxdeform", *arguments]
     if target == "closed":
         reader, writer = os.pipe()
@@ -244,7 +249,7 @@ def spoken_to(files, target, *arguments):
     else:
         writer = os.open("/dev/full", os.O_WRONLY)
     try:
-        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(command, stdout=writer, stderr=errors, text=True)
     finally:
         os.close(writer)
     return done.returncode, done.stderr
@@ -264,6 +269,39 @@ def test_the_result_is_written_though_nobody_listens(files, target, end):
     assert found == end
     assert jd.load_mesh(out).n_vertices == 722
     assert spoken_to(files, target, "inspect", out) == end
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has such a device")
+@pytest.mark.parametrize("target", ["closed", "full"])
+def test_every_file_is_written_though_nobody_hears_the_warnings(files, target):
+    """As in ``2>&1 | true``: each frame loses a material, and says so to nobody."""
+    bar = files / "bar.obj"
+    jd.save_mesh(bar, jd.load_mesh(files / "bar.off"))
+    bar.write_text(bar.read_text().replace("\nf ", "\nusemtl wood\nf ", 1))
+    code, _ = spoken_to(
+        files, target, "deform", bar, "--handles", files / "bend.json",
+        "-o", files / "out.ply", "--frames", "3", "--method", "laplacian",
+        errors=subprocess.STDOUT,
+    )  # fmt: skip
+    assert code == (target == "full")
+    for k in (1, 2, 3):
+        assert jd.load_mesh(files / f"out_000{k}.ply").n_vertices == 722
+
+
+def test_cells_that_are_inside_out_are_told(run, files, monkeypatch):
+    plain = jd.deform
+
+    def with_a_flipped_cell(*arguments, **settings):
+        out = plain(*arguments, **settings)
+        return dataclasses.replace(out, transforms=out.transforms.at[5, 0].multiply(-1.0))
+
+    monkeypatch.setattr(jd, "deform", with_a_flipped_cell)
+    code, out, _ = run(
+        "deform", files / "bar.off", "--handles", files / "bend.json", "--rigidity", 1,
+        "-o", files / "out.ply",
+    )  # fmt: skip
+    assert code == 0
+    assert "Cells inside out (det T <= 0): 5 (1 of 722)." in out
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell closes them")

@@ -198,6 +198,14 @@ def test_derivatives_to_the_twelve_numbers_of_a_transform():
             np.testing.assert_allclose(gradient[at], want, rtol=FD, atol=1e-7)
 
 
+def test_motions_that_no_number_holds_are_named():
+    zero = np.zeros((1, 3))
+    with pytest.raises(jd.InputError, match="rotations turn by inf, of which rounding leaves no"):
+        jd.rigid_transforms([[1e200, 0.0, 0.0]], zero, zero)
+    with pytest.raises(jd.InputError, match="overflow"):
+        jd.rigid_transforms(zero, [[1.7e308, 0.0, 0.0]], [[1.7e308, 0.0, 0.0]])
+
+
 def test_shape_errors_also_come_while_tracing():
     vertices, weights, moves = random_skin()
     with pytest.raises(jd.InputError, match="transforms have shape"):

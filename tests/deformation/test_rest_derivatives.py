@@ -85,13 +85,22 @@ def test_derivatives_to_the_edge_weights(case):
     np.testing.assert_allclose(jnp.sum(jax.grad(loss)(jnp.asarray(w)) * direction), want, rtol=FD)
 
 
-@pytest.mark.slow
-def test_second_derivatives_to_the_rest_shape(case):
-    """Twice along a direction, and along it and to the rigidity: forward over forward."""
+def forward(function):
+    """Return the derivative along the first unknown, in forward mode."""
+    return lambda x: jax.jvp(function, (x,), (jnp.array([1.0, 0.0]),))[1]
+
+
+def reverse(function):
+    """Return the derivative along the first unknown, in reverse mode."""
+    return lambda x: jax.grad(function)(x)[0]
+
+
+@pytest.fixture(scope="module")
+def second_derivatives(case):
+    """Twice along a direction, and along it and to the rigidity, by differences of the whole."""
     mesh, handles, targets, _, weight, direction = case
     settings = {"solver": replace(TIGHT, tolerance=1e-16)}
-    problem = jd.precompute(mesh, handles)
-    near = jd.deform(problem, targets, 0.7, **settings).vertices
+    near = jd.deform(jd.precompute(mesh, handles), targets, 0.7, **settings).vertices
 
     def whole(s, u):
         moved = jd.precompute(jd.Mesh(mesh.vertices + s * direction, mesh.faces), handles)
@@ -103,16 +112,24 @@ def test_second_derivatives_to_the_rest_shape(case):
     corners = [i * j * whole(i * h, j * h) for i in (-1, 1) for j in (-1, 1)]
     mixed = float(sum(corners)) / (4 * h**2)
 
+    return near, twice, mixed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("inner", [forward, reverse])
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
+def test_second_derivatives_to_the_rest_shape(case, second_derivatives, inner, outer):
+    mesh, handles, targets, _, weight, direction = case
+    near, twice, mixed = second_derivatives
+    problem = jd.precompute(mesh, handles)
+
     def loss(x):
         rest = jnp.asarray(mesh.vertices) + x[0] * direction
         return value(
             jd.deform(problem, targets, 0.7 * jnp.exp(x[1]), rest=rest, start=near), weight
         )
 
-    def along(x):
-        return jax.jvp(loss, (x,), (jnp.array([1.0, 0.0]),))[1]
-
-    got = jax.jit(jax.jacfwd(along))(jnp.zeros(2))
+    got = jax.jit(outer(inner(loss)))(jnp.zeros(2))
     np.testing.assert_allclose(got[0], twice, rtol=2e-3)
     np.testing.assert_allclose(got[1], mixed, rtol=1e-2)  # the difference is of second order
 

@@ -138,8 +138,8 @@ def hurried(file: Path) -> None:
     sys.modules["kept"] = kept  # pyright: ignore[reportArgumentType]
 
 
-def interrupted(file: Path, once: int) -> None:
-    """Press Ctrl-C while a deformation, or an estimate, runs that would take half an hour."""
+def interrupted(file: Path, kind: int) -> None:
+    """Press Ctrl-C while a deformation, an estimate or a path runs: it would take half an hour."""
     # Shells make background jobs deaf to it, and Python leaves that so.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     made = problem()
@@ -159,8 +159,12 @@ def interrupted(file: Path, once: int) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press, daemon=True).start()
-    if once:
-        deformed(made, solver=jd.Alternating(1_000_000))
+    endless = jd.Alternating(1_000_000)
+    if kind == 1:
+        deformed(made, solver=endless)
+    if kind == 2:
+        path = jd.bend(made.vertices[np.asarray(made.handles)], 60.0)[None]
+        jd.deform_path(made, path, 0.1, solver=endless, progress=print)
     jd.estimate_rigidity(made, pose, solver=jd.Alternating(1_000_000))
 
 

@@ -68,11 +68,11 @@ def test_a_process_may_end_while_deformations_run(run, expected):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to a process of its own")
-@pytest.mark.parametrize("once", [1, 0], ids=["deform", "estimate"])
-def test_ctrl_c_is_heard_while_jax_computes(run, once):
+@pytest.mark.parametrize("kind", [1, 0, 2], ids=["deform", "estimate", "path"])
+def test_ctrl_c_is_heard_while_jax_computes(run, kind):
     """And the process ends, though the deformation would go on for half an hour."""
     with pytest.raises(subprocess.CalledProcessError) as error:
-        run("interrupted", once)
+        run("interrupted", kind)
     assert error.value.returncode == -signal.SIGINT
 
 

@@ -10,6 +10,7 @@ import pytest
 from helpers import CASES, replaced, tetrahedron
 
 import jaxdeform as jd
+from jaxdeform._apps.batch.manifest import read_manifest
 from jaxdeform._mesh.files import check_output
 
 
@@ -167,14 +168,30 @@ def test_a_file_made_to_fill_the_memory_is_refused(tmp_path):
     assert peak < 3 * 200 * path.stat().st_size
 
 
+def _load_handles(path):
+    return jd.load_handles(path, jd.Mesh(*tetrahedron()))
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has none")
-@pytest.mark.parametrize("door", [jd.load_mesh, jd.load_rigidity, jd.inspect, jd.repair])
-def test_pipes_and_devices_are_refused(tmp_path, door):
-    os.mkfifo(tmp_path / "pipe.ply")
-    (tmp_path / "zero.ply").symlink_to("/dev/zero")
-    for name in ("pipe.ply", "zero.ply"):
+@pytest.mark.parametrize(
+    ("door", "suffix"),
+    [
+        *((door, ".ply") for door in (jd.load_mesh, jd.load_rigidity, jd.inspect, jd.repair)),
+        (_load_handles, ".json"),
+        (_load_handles, ".sel"),
+        (jd.load_skeleton, ".tgf"),
+        *((read_manifest, suffix) for suffix in (".csv", ".jsonl", ".parquet")),
+    ],
+)
+def test_pipes_and_devices_are_refused(tmp_path, door, suffix):
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    pipe, zero = tmp_path / f"pipe{suffix}", tmp_path / f"zero{suffix}"
+    os.mkfifo(pipe)
+    zero.symlink_to("/dev/zero")
+    for path in (pipe, zero):
         with pytest.raises(jd.InputError, match="it is a pipe or a device"):
-            door(tmp_path / name)
+            door(path)
 
 
 @pytest.mark.skipif(not Path("/proc/version").exists(), reason="Linux has it")

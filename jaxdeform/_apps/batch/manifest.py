@@ -14,7 +14,7 @@ import jaxdeform as jd
 from jaxdeform._apps.methods import Method
 from jaxdeform._errors import a_or_an, shown
 from jaxdeform._mesh.expressions import matching
-from jaxdeform._mesh.reading import read_text
+from jaxdeform._mesh.reading import read_bytes, read_text
 from jaxdeform._mesh.words import real
 
 # The results of a run are those of methods that have an energy.
@@ -109,7 +109,7 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
         import pyarrow.parquet
 
         try:
-            yield from pyarrow.parquet.read_table(path).to_pylist()
+            yield from pyarrow.parquet.read_table(io.BytesIO(read_bytes(path))).to_pylist()
         except (OSError, ValueError) as error:
             raise jd.InputError(f"{path}: is no Parquet file ({error}): write it again") from error
     else:
