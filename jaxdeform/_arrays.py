@@ -65,7 +65,7 @@ def read_numbers(value: ArrayLike, name: str) -> np.ndarray:
         return value
     if isinstance(value, Tracer) or any(isinstance(x, Tracer) for x in _leaves(value, name)):
         raise InputError(
-            f"{name}: traced by JAX (jit, vmap or grad), but this is worked out in NumPy, without "
+            f"{name}: traced by JAX (jit, vmap or grad), but this is computed in NumPy, without "
             "derivatives: give known numbers"
         )
     return _read_numpy(value, name)

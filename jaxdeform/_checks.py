@@ -181,7 +181,9 @@ def host_rows_of_three(name: str, value: ArrayLike) -> Float[np.ndarray, "rows 3
 
 def _read_rows(name: str, array: Array | np.ndarray, unit: str) -> Array | np.ndarray:
     if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-        raise InputError(f"{name} have shape {array.shape}: give (n, 3), at least one {unit}")
+        raise InputError(
+            f"{name} have shape {array.shape}: give one row (x, y, z) per {unit}, at least one"
+        )
     return read_positions(name, array, array.shape, array.dtype, unit)
 
 

@@ -136,12 +136,14 @@ def test_float64_after_jax_was_switched_to_float32(calls):
     """Not four warnings of JAX, which the tests take as errors."""
     problem = calls["energy"][1]["problem"]
     editor = calls["LaplacianEditor"][0]
+    coarse = jd.coarsen(problem, 6)
     jax.config.update("jax_enable_x64", False)
     try:
-        for name, call in {
-            "problem": lambda: jd.deform(problem, TARGETS, 1.0),
-            "this editor": lambda: editor(TARGETS),
-        }.items():
+        for name, call in (
+            ("problem", lambda: jd.deform(problem, TARGETS, 1.0)),
+            ("problem", lambda: coarse.start(TARGETS, 1.0)),
+            ("this editor", lambda: editor(TARGETS)),
+        ):
             with pytest.raises(jd.InputError, match=f"{name} is float64, but jax_enable_x64"):
                 call()
         assert jd.precompute(MESH, HANDLES).dtype == np.float32

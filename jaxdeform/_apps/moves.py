@@ -29,7 +29,7 @@ class Motion(NamedTuple):
         if self.about and not self.rotate:
             raise jd.InputError("--about is the centre of a rotation: give --rotate AXIS DEGREES")
 
-    def part(self, share: float) -> "Motion":
+    def fraction(self, share: float) -> "Motion":
         """Return this share of the motion, from 0 to 1."""
         rotate = self.rotate and (self.rotate[0], share * self.rotate[1])
         x, y, z = self.translate or (0.0, 0.0, 0.0)
@@ -76,7 +76,7 @@ class Moves(NamedTuple):
         if self.motion is None:
             return (1 - share) * self.rest + share * self.targets
         at = self.rest.copy()
-        at[self.moved] = self.motion.part(share).of(at[self.moved])
+        at[self.moved] = self.motion.fraction(share).of(at[self.moved])
         return at
 
 

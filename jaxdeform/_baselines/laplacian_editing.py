@@ -52,11 +52,14 @@ class LaplacianEditor(eqx.Module):
     **Fields**
 
     - rest: (vertices, 3) rest positions.
+    - center: (3,) the centre of the mesh. Positions are solved for relative to it, so that no digit
+      is lost far from the origin.
     - handles: (handles,) indices of the handle vertices, in the order of the targets' rows.
     - equations: the normal equations and their factor.
     """
 
     rest: Float[Array, "vertices 3"]
+    center: Float[Array, "3"]
     handles: Int[np.ndarray | Array, "handles"]
     equations: _Equations
 
@@ -69,8 +72,9 @@ class LaplacianEditor(eqx.Module):
             led[np.asarray(self.handles)] = targets
         else:
             led = self.rest.at[self.handles].set(targets)
-        led = fill_up(led.T, self.equations.pull.size // 3)
-        return cut(_solve(self.equations, jnp.asarray(led)).T, len(self.rest), 0)
+        led = fill_up((led - self.center[None]).T, self.equations.pull.size // 3)
+        moved = cut(_solve(self.equations, jnp.asarray(led)).T, len(self.rest), 0)
+        return moved + self.center[None]
 
 
 def laplacian_editor(
@@ -119,14 +123,17 @@ def laplacian_editor(
     index, free, soft = split_handles(mesh, handles, handle_weights)
     cells = spokes(mesh, weights=weights)
     laplacian = normalised_laplacian(cells.edges, cells.weights, n)
+    rest = mesh.vertices - mesh.center
     if similarity:
-        operator = sp.kron(sp.identity(3), laplacian) - _rotated_details(mesh, laplacian)
+        operator = sp.kron(sp.identity(3), laplacian) - _rotated_details(
+            mesh.edges, rest, laplacian
+        )
         pull = np.zeros((1, 3 * n))
         free, soft = np.tile(free, 3), np.tile(soft, 3)
-        positions = np.tile(mesh.vertices, (3, 1))
+        positions = np.tile(rest, (3, 1))
     else:
-        operator, positions = laplacian, mesh.vertices
-        pull = (laplacian.T @ (laplacian @ mesh.vertices)).T
+        operator, positions = laplacian, rest
+        pull = (laplacian.T @ (laplacian @ rest)).T
     dtype, size = np.dtype(jnp.result_type(float)), bucket(n)
     normal = enlarge(operator.T @ operator + sp.diags(soft), size, len(soft) // n)
 
@@ -150,7 +157,7 @@ def laplacian_editor(
         normal=EllMatrix.build([[normal]], dtype, WIDTHS[-1]),
         factor=factor,
     )
-    return LaplacianEditor(put(mesh.vertices), index, equations)
+    return LaplacianEditor(put(mesh.vertices), put(mesh.center), index, equations)
 
 
 def laplacian_editing(
@@ -189,22 +196,24 @@ def laplacian_editing(
     return edit(targets)
 
 
-def _rotated_details(mesh: Mesh, laplacian: sp.csr_matrix) -> sp.csr_matrix:
+def _rotated_details(
+    edges: Int[np.ndarray, "edges 2"],
+    rest: Float[np.ndarray, "vertices 3"],
+    laplacian: sp.csr_matrix,
+) -> sp.csr_matrix:
     """Return M with ``(M p')_i = T_i(p') delta_i``, where p' holds all x, then all y, then all z.
 
     ``T_i q = s q + h x q`` fits the centred neighbourhood: ``s = sum q.p' / sum |q|^2`` and
     ``h = J^-1 sum q x p'`` with ``J = sum |q|^2 I - q q^T``. This is the closed form of Sorkine et
     al. (2004).
     """
-    n = mesh.n_vertices
-    delta = laplacian @ mesh.vertices
-    i = np.concatenate([mesh.edges[:, 0], mesh.edges[:, 1], np.arange(n)])
-    j = np.concatenate([mesh.edges[:, 1], mesh.edges[:, 0], np.arange(n)])
+    n = len(rest)
+    delta = laplacian @ rest
+    i = np.concatenate([edges[:, 0], edges[:, 1], np.arange(n)])
+    j = np.concatenate([edges[:, 1], edges[:, 0], np.arange(n)])
     count = np.bincount(i, minlength=n)
-    center = (
-        np.stack([np.bincount(i, mesh.vertices[j, a], n) for a in range(3)], 1) / count[:, None]
-    )
-    q = mesh.vertices[j] - center[i]
+    center = np.stack([np.bincount(i, rest[j, a], n) for a in range(3)], 1) / count[:, None]
+    q = rest[j] - center[i]
     square = np.bincount(i, (q**2).sum(axis=1), n)
     square = np.where(square > 0, square, 1.0)
     outer = np.zeros((n, 3, 3))

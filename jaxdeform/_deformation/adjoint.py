@@ -110,8 +110,8 @@ class Implicit:
         start: Float[Array, "3 vertices"],
     ) -> tuple[Descent, Anchor]:
         """Run the solver on constants, and give its end the derivative of the fixed point."""
-        known = inputs._replace(geometry=None)
-        end = solver.minimize(energy, *jax.lax.stop_gradient((system, known, start)))
+        plain = inputs._replace(geometry=None)
+        end = solver.minimize(energy, *jax.lax.stop_gradient((system, plain, start)))
         end = jax.lax.stop_gradient(end)
         state = end.positions, end.transforms
         p, anchor = self.minimum(energy, system, inputs, *state)
@@ -167,8 +167,8 @@ class Implicit:
 
         By Newton's method. The transformations follow its last step to first order.
         """
-        known = inputs._replace(geometry=None)
-        system, inputs, p = jax.lax.stop_gradient((system, known, p))
+        plain = inputs._replace(geometry=None)
+        system, inputs, p = jax.lax.stop_gradient((system, plain, p))
 
         def evaluate(x):
             at = energy.evaluate(system, inputs, x)

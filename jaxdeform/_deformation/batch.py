@@ -76,9 +76,9 @@ def deform_batch(
 
     **Returns** a `Solution` whose arrays have a leading axis of members.
 
-    **Raises** InputError: shapes that do not fit; a setting that is none; values that JAX traces.
-    An entry that is not finite, or a negative rigidity, does not raise: the ``result`` of its
-    member is ``bad_input``, and the others are deformed.
+    **Raises** InputError: shapes that do not fit; something else where a setting belongs; values
+    that JAX traces. An entry that is not finite, or a negative rigidity, does not raise: the
+    ``result`` of its member is ``bad_input``, and the others are deformed.
 
     Example:
         >>> import jaxdeform as jd, numpy as np

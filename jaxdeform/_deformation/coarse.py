@@ -80,6 +80,7 @@ class CoarseProblem(eqx.Module):
         **Raises** InputError as `deform` does.
         """
         problem = self.fine
+        check_problem(problem)
         targets = from_center(problem, "targets", targets, (len(problem.handles), 3), "handle")
         inputs = read_inputs(problem, targets, rigidity, None)
         system = self.coarse.system

@@ -44,7 +44,8 @@ def read_geometry(
 ) -> "Geometry":
     """Return the geometry from the problem's own rest positions and weights, or raise InputError.
 
-    They are given only to be differentiated in, so other values than the problem's are refused.
+    They are given only for derivatives with respect to them. Other values than the problem's are
+    refused.
     """
     cells, dtype = problem.own_cells, problem.dtype
     graph = _graph_of(cells, dtype)
@@ -65,7 +66,7 @@ def read_geometry(
             if far.any():
                 raise InputError(
                     f"{name} of {unit} {np.argwhere(far)[0][0]} are not the problem's own: they "
-                    "are given to be differentiated in; call precompute for another rest shape"
+                    "are given only for derivatives; call precompute for another rest shape"
                 )
     center = problem.system.center
     moved = jnp.asarray(fill_up(moved.T - center[:, None], problem.bucket))

@@ -144,7 +144,7 @@ class Newton(_Material):
     max_steps: int = 60
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-        """Return the minimisers T (3, 3, n)."""
+        """Return the minimisers T (3, 3, cells)."""
         rotation = polar_rotation_of_grid(as_grid(c))
         m = product(as_grid(c), rotation)
         m = [[m[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]  # C R = U S U^T
@@ -186,7 +186,7 @@ class LBFGS(_Material):
         check_tolerance("tolerance of LBFGS", self.tolerance)
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-        """Return the minimisers T (3, 3, n)."""
+        """Return the minimisers T (3, 3, cells)."""
         c, b, lam = _scaled(c, b, rigidity)
         solve = jax.vmap(self._minimize_cell, in_axes=-1, out_axes=-1)
         return solve(polar_rotation(c), c, b, lam)
@@ -248,7 +248,7 @@ class GradientDescent(_Material):
     max_steps: int = 500
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-        """Return the minimisers T (3, 3, n)."""
+        """Return the minimisers T (3, 3, cells)."""
         c, b, lam = _scaled(c, b, rigidity)
         start = polar_rotation(c)
         # phi(T) <= phi(R) bounds |T|; the Hessian of phi is below 4 lambda (3 |T|^2) + 2 b there.
@@ -279,7 +279,7 @@ class RotationFit:
     """The closest proper rotation (ARAP's local step, Sorkine and Alexa 2007); lambda is unused."""
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-        """Return the rotations R (3, 3, n) that maximise tr(R C)."""
+        """Return the rotations R (3, 3, cells) that maximise tr(R C)."""
         del b, rigidity
         return polar_rotation(c)
 
@@ -304,7 +304,7 @@ class AffineFit:
     """
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
-        """Return T (3, 3, n) with ``T B = C^T``."""
+        """Return T (3, 3, cells) with ``T B = C^T``."""
         del rigidity
         floor = 1e3 * jnp.finfo(c.dtype).eps * jnp.max(jnp.abs(b), axis=0, keepdims=True)
         floor = jnp.maximum(floor, jnp.finfo(c.dtype).tiny)

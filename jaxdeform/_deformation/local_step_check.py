@@ -1,4 +1,4 @@
-"""Whether a local step is one: said at once, instead of by an error deep inside compiled code."""
+"""Refuse at once what is no local step, instead of failing deep inside compiled code."""
 
 import inspect
 from functools import cache

@@ -91,7 +91,7 @@ class _Hessian(NamedTuple):
 
         def solve(_, r: Matrices) -> Matrices:
             right = r / self.scale[None, None]
-            # Else XLA solves again for each input that reads the solution: 3.4 instead of 1.5 ms.
+            # Otherwise XLA solves again for each input that reads it: 3.4 instead of 1.5 ms.
             return without_fusion(jnp.any(self.scale > 0), r, self.factor.solve, right)
 
         return jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)

@@ -46,12 +46,12 @@ from jaxdeform._linalg.factor_cache import (
 from jaxdeform._linalg.ffi import installed_interface
 from jaxdeform._linalg.host_call import HostFunction
 
-# Tried one after another where rounding leaves no Cholesky factor: the part of A that is mixed in.
+# Tried in turn where rounding leaves no Cholesky factor: the fraction of A that is mixed in.
 _MIXES = (0.0, 1e-6, 1e-3, 0.1)
 # K in float32 is off by 1e-7 of what A weighs in each cell.
 _FLOAT32_MIXES = (1e-5, 1e-3, 0.1)
 
-# It is used where this part of all cells is softer than this constant (rigidity_from_material).
+# It is used where this fraction of all cells is softer than this constant (rigidity_from_material).
 _SOFT_PART, _SOFT = 0.1, 1.0
 # Softer cells count as of this constant.
 _LEAST = 1e-6
@@ -71,8 +71,8 @@ def metric_of(
 ) -> Metric | None:
     """Return the metric for the law of a local step at this rigidity; None for A.
 
-    It is A too where factors are not on the host (on a GPU a new factor is dear), and for laws that
-    do not name their strain energy.
+    It is A too where factors are not on the host (on a GPU a new factor is expensive), and for laws
+    that do not name their strain energy.
     """
     law = getattr(local, "strain_rigidity", None)
     if choice == "stiffness" or law is None or not isinstance(system.factor, HostCholesky):

@@ -22,7 +22,7 @@ from jaxdeform._errors import ArrayLike
 
 # More steps of Lanczos than a descent takes at its end.
 _MOST = 100
-# A step that would gain more than this part of the energy: the shape is on its way to a minimum.
+# A step that would gain more than this fraction of the energy: the shape is still on its way.
 _STATIONARY = 1e-4
 
 

@@ -30,7 +30,7 @@ from jaxdeform._linalg.lbfgs import Minimum, Settings
 # Steps of Lanczos where the sign does not show before.
 MOST = 64
 # Descents at most, and how far from a saddle the next one starts, in diagonals.
-_TURNS, _AWAY = 6, 0.02
+_DESCENTS, _AWAY = 6, 0.02
 # Members of a batch that are looked at side by side: each takes 650 bytes a vertex.
 _AT_ONCE = 8
 
@@ -76,7 +76,7 @@ def lowest_curvature(
 class _Way(NamedTuple):
     """A descent that goes on after saddles."""
 
-    turn: Int[Array, ""]
+    descents: Int[Array, ""]
     best: Minimum
     along: Float[Array, "3 vertices"]
     """The way on from the best end, as long as the next try should go."""
@@ -101,7 +101,7 @@ def leave_saddles(
     rounding = 1e3 * jnp.finfo(start.dtype).eps
 
     def descend_on(way: _Way) -> _Way:
-        first = way.turn == 0
+        first = way.descents == 0
         end = descend(jnp.where(first, start, way.best.p + way.along))
         old, new = way.best.energy[way.best.steps], end.energy[end.steps]
         margin = jnp.maximum(settings.tolerance, rounding) * jnp.abs(old)
@@ -112,11 +112,11 @@ def leave_saddles(
         both = jax.tree.map(partial(jnp.where, first), end, _joined(way.best, end))
         best = jax.tree.map(partial(jnp.where, lower), both, way.best)
         at_saddle = jnp.where(lower, end.converged & (value < negative), higher)
-        return _Way(way.turn + 1, best, jnp.where(lower, along, 0.2 * way.along), at_saddle)
+        return _Way(way.descents + 1, best, jnp.where(lower, along, 0.2 * way.along), at_saddle)
 
     unknown = Minimum.unknown(start, settings)
     begin = _Way(jnp.zeros((), jnp.int32), unknown, jnp.zeros_like(start), jnp.asarray(True))
-    going = lambda way: way.at_saddle & (way.turn < _TURNS)  # noqa: E731
+    going = lambda way: way.at_saddle & (way.descents < _DESCENTS)  # noqa: E731
     end = jax.lax.while_loop(going, descend_on, begin)
     return end.best, end.at_saddle
 

@@ -127,8 +127,9 @@ def deform(
       about the side, and on a Moebius band they cannot: around each vertex one side is chosen.
     - adjoint: how derivatives are made: ``Unrolled()`` (default of Alternating) or ``Implicit()``
       (the only one of QuasiNewton).
-    - rest: (vertices, 3), the problem's own rest positions, given to be differentiated in: the
-      derivative is that of ``precompute`` and ``deform`` together. With ``Implicit()`` only.
+    - rest: (vertices, 3), the problem's own rest positions, given for derivatives with respect to
+      them: the derivative is that of ``precompute`` and ``deform`` together. With ``Implicit()``
+      only.
     - edge_weights: (edges,), the problem's own edge weights, likewise. Without them the derivative
       to ``rest`` includes that of the cotangent weights.
     - throw: raise an error if the result is not ``ok``, also inside jit. By default numerical
@@ -290,7 +291,7 @@ def solution_of(system: System, inputs: Inputs, end: Descent, value: Float[Array
 
 @jax.custom_jvp
 def without_derivative(system: System) -> System:
-    """Return the system, which refuses to be differentiated in."""
+    """Return the system, which refuses derivatives with respect to it."""
     return system
 
 

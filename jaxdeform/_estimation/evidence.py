@@ -45,12 +45,12 @@ def find_patterns(run: Any, prior: Prior) -> Patterns:
     metric = vectors.T @ np.asarray(prior.product(jnp.asarray(vectors)))
     root = np.linalg.cholesky(metric)
     flat = np.linalg.solve(root, effects.reshape(-1, len(metric)).T).T
-    _, lengths, turn = np.linalg.svd(flat, full_matrices=False)
-    vectors = np.linalg.solve(root, vectors.T).T @ turn.T
+    _, lengths, rotation = np.linalg.svd(flat, full_matrices=False)
+    vectors = np.linalg.solve(root, vectors.T).T @ rotation.T
     count = prior.n_vertices
     mean = np.mean(np.asarray(run.theta)[:count])
     seen = np.asarray(run.jacobian.mv(run.theta - mean) - run.residual, float)
-    data = turn @ (flat.T @ seen.ravel())
+    data = rotation @ (flat.T @ seen.ravel())
     return Patterns(vectors[:count], lengths**2, data, float(np.sum(seen**2)))
 
 

@@ -91,14 +91,14 @@ def estimate_rigidity_field(
 
     - problem, observed, targets, mask, solver, adjoint, max_evaluations, progress, throw: as
       `estimate_rigidity`.
-    - smoothness: weight of the prior. Left out, it is the one under which the poses are most
+    - smoothness: weight of the prior. By default, the one under which the poses are most
       probable (marginal likelihood): ``(noise / (diagonal * slope))^2``, with the standard
       deviation of the noise of a coordinate and of the difference of log rigidity between
       neighbors. More smooths. That of total variation is the largest under which the misfit still
       is that of the noise (Morozov's discrepancy principle).
     - prior: ``"smooth"``, or ``"total_variation"`` for parts of one material each. The second takes
       twice the time.
-    - start: a number or (n,); a medium material if left out.
+    - start: a number or (vertices,); a medium material if left out.
 
     **Returns** a `FieldEstimate`. Its interval takes targets as exact, and is that of the smooth
     prior.

@@ -78,12 +78,12 @@ class FieldSearch:
             strongest = self.problem.mesh.diagonal**2 * _SMOOTHEST / FLAT
             most = self.misfit(found.run) * np.sqrt(count / max(count - freedom, 1.0))
             most *= 1.0 + 1.0 / np.sqrt(2.0 * count)  # it is known to that
-        for turn in range(_REWEIGHTINGS):
+        for k in range(_REWEIGHTINGS):
             theta, before = found.run.theta, self.prior
             self.prior = Prior.of(self.problem, found.theta(self.problem))
             # As strong as the smooth prior at first. (A constant field costs nothing under either.)
             costs = [max(prior.value(theta), 1e-300) for prior in (before, self.prior)]
-            stronger = _STRONGER if turn else costs[0] / costs[1]
+            stronger = _STRONGER if k else costs[0] / costs[1]
             weight = found.weight * (1.0 if smoothness else stronger)
             if weight > strongest:
                 break

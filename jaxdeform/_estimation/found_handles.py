@@ -73,7 +73,7 @@ def find_handle_groups(
     **Arguments**
 
     - mesh: the rest shape.
-    - deformed: (n, 3) or (poses, n, 3) positions.
+    - deformed: (vertices, 3) or (poses, vertices, 3) positions.
     - tolerance: how far a vertex may be from the motion of its group, as a fraction of the bounding
       box diagonal. By default 1e-6 where twice that finds no others. Else about four standard
       deviations of the noise (more in many poses), taken from the 1-rings that moved most rigidly:

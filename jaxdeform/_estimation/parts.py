@@ -75,16 +75,16 @@ def estimate_rigidity(
     **Arguments**
 
     - problem: the rest shape with its handles; `find_handles` finds them if need be.
-    - observed: (n, 3) or (poses, n, 3) positions.
-    - parts: (n,) the part of each vertex, 0 to p - 1; one part by default. A mask or a selection
-      makes two: its vertices are part 1, all others part 0.
-    - targets: (h, 3) or (poses, h, 3) where the handles were put; by default their observed
-      positions.
+    - observed: (vertices, 3) or (poses, vertices, 3) positions.
+    - parts: (vertices,) the part of each vertex, 0 to p - 1; one part by default. A mask or a
+      selection makes two: its vertices are part 1, all others part 0.
+    - targets: (handles, 3) or (poses, handles, 3) where the handles were put; by default their
+      observed positions.
     - target_noise: noise of the targets, as a multiple of that of the observed vertices. By
       default 0 for targets that were given, and 1 for observed ones. Measured targets given as
       exact make the intervals far too narrow: say 1 then.
-    - mask: (n,) or (poses, n), False where a vertex was not seen; its position is not read. Or a
-      selection of the vertices that were seen.
+    - mask: (vertices,) or (poses, vertices), False where a vertex was not seen; its position is not
+      read. Or a selection of the vertices that were seen.
     - start: first guess, a number or (parts,); a medium material by default.
     - solver, adjoint: as in `deform`. Poses that were made by 100 steps of the thesis's
       iteration are no equilibria: fit those with ``Alternating(steps=100)``.

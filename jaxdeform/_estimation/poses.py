@@ -87,8 +87,8 @@ def without(problem: Problem, poses: Poses, dropped: Bool[np.ndarray, "poses ver
 
 def _compared(problem, targets, observed, counted) -> Poses:
     """Return the poses, of which these vertices are compared."""
-    known = np.where(counted[..., None], observed, 0.0).astype(problem.dtype)
-    return Poses(targets, known, counted, _starts(problem, known, counted, targets))
+    shown = np.where(counted[..., None], observed, 0.0).astype(problem.dtype)
+    return Poses(targets, shown, counted, _starts(problem, shown, counted, targets))
 
 
 def read_poses(
@@ -138,11 +138,11 @@ def _starts(problem, observed, counted, goal) -> Float[np.ndarray, "poses vertic
     """Return the poses as observed; what was not seen follows by Laplacian editing."""
     starts = np.array(observed)
     starts[:, problem.handles] = goal
-    for pose, known in enumerate(counted):
-        known = known.copy()
-        known[problem.handles] = True
-        if not known.all():
-            at = np.flatnonzero(known)
+    for pose, seen in enumerate(counted):
+        seen = seen.copy()
+        seen[problem.handles] = True
+        if not seen.all():
+            at = np.flatnonzero(seen)
             starts[pose] = laplacian_editing(problem.mesh, at, starts[pose, at])
     return starts.astype(problem.dtype)
 

@@ -55,13 +55,14 @@ def segment_rigidity(
     **Arguments**
 
     - mesh: the mesh of the field.
-    - field: (n,) rigidity of each vertex, above 0: ``fit.field`` of `estimate_rigidity_field`.
+    - field: (vertices,) rigidity of each vertex, above 0: ``fit.field`` of
+      `estimate_rigidity_field`.
     - k: number of parts, at most 64.
-    - interval: (n, 2) interval of each: ``fit.interval``. Its ends may be 0 and infinity. Left out,
-      all vertices are known equally well.
+    - interval: (vertices, 2) interval of each: ``fit.interval``. Its ends may be 0 and infinity. By
+      default all vertices are known equally well.
 
-    **Returns** (n,) the part of each vertex, for ``estimate_rigidity(parts=)``: 0 is the softest,
-    k - 1 the stiffest.
+    **Returns** (vertices,) the part of each vertex, for ``estimate_rigidity(parts=)``: 0 is the
+    softest, k - 1 the stiffest.
 
     **Raises** InputError: shapes that do not fit; a rigidity that is not above 0 and finite; an
     interval that is not a number, below 0, or whose ends are in the wrong order; no bounded

@@ -101,8 +101,8 @@ def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
                 f'{where}: give either "vertices", a list of indices, or "where", an expression '
                 'such as "y < 0.1"'
             )
-        known = "vertices", "where", "rotation", "translation", "targets", "name"
-        _check_keys(where, group, *known)
+        keys = "vertices", "where", "rotation", "translation", "targets", "name"
+        _check_keys(where, group, *keys)
         index = _chosen(where, group, mesh)
         handles.append(index)
         targets.append(_moved(where, group, mesh.vertices[index]))
@@ -118,10 +118,10 @@ def _chosen(where: str, group: dict[str, Any], mesh: Mesh) -> Int[np.ndarray, "c
         raise InputError(f"{where}: {error}") from error
 
 
-def _check_keys(where: str, given: dict[str, Any], *known: str) -> None:
-    unknown = sorted(set(given) - set(known))
+def _check_keys(where: str, given: dict[str, Any], *keys: str) -> None:
+    unknown = sorted(set(given) - set(keys))
     if unknown:
-        raise InputError(f"{where} has the unknown key {shown(unknown[0])}: use {', '.join(known)}")
+        raise InputError(f"{where} has the unknown key {shown(unknown[0])}: use {', '.join(keys)}")
 
 
 def _moved(where: str, group: dict[str, Any], points: np.ndarray) -> np.ndarray:

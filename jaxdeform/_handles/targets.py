@@ -55,8 +55,8 @@ def rotate(
 ) -> Points:
     """Return the points rotated about an axis through a centre (their centroid if left out).
 
-    **Arguments**: points (points, 3); degrees, a number, counter-clockwise for a viewer whom the
-    axis points at; axis, 'x', 'y', 'z' or a vector (3,) of any length; center (3,).
+    **Arguments**: points (points, 3); degrees, a number, counter-clockwise as seen from
+    where the axis points to; axis, 'x', 'y', 'z' or a vector (3,) of any length; center (3,).
 
     **Returns** (points, 3), a jax.Array if points, degrees or center is one, else a NumPy array.
 
@@ -155,7 +155,9 @@ def _points(xp, points: ArrayLike) -> Points:
         single = array.dtype.kind == "f" and array.dtype.itemsize <= 4
         array = read_host_array(array, np.float32 if single else np.float64, "points")
     if array.ndim != 2 or array.shape[1] != 3 or array.shape[0] == 0:
-        raise InputError(f"points have shape {array.shape}: give (n, 3) with n >= 1")
+        raise InputError(
+            f"points have shape {array.shape}: give one row (x, y, z) per point, at least one"
+        )
     if not isinstance(array, Tracer):
         bad = np.flatnonzero(~np.isfinite(np.asarray(array)).all(axis=1))
         if bad.size:

@@ -47,13 +47,15 @@ def fill_up(x: jax.Array, size: int, value: float = ...) -> np.ndarray | jax.Arr
 @overload
 def fill_up(x: np.ndarray | jax.Array, size: int, value: float = ...) -> np.ndarray | jax.Array: ...
 def fill_up(x, size: int, value: float = 0.0):
-    """Return an array with so many entries along its last axis, in NumPy where it is known."""
+    """Return an array with so many entries along its last axis, in NumPy unless JAX traces it."""
     missing = size - x.shape[-1]
     if not missing:
         return x
     widths = [(0, 0)] * (x.ndim - 1) + [(0, missing)]
-    known = is_concrete(x)
-    return (np if known else jnp).pad(np.asarray(x) if known else x, widths, constant_values=value)
+    concrete = is_concrete(x)
+    return (np if concrete else jnp).pad(
+        np.asarray(x) if concrete else x, widths, constant_values=value
+    )
 
 
 def cut(x: jax.Array, count: int, axis: int = -1) -> jax.Array:

@@ -22,7 +22,7 @@ from jaxdeform._linalg.ffi import installed_interface
 from jaxdeform._linalg.host_call import HostFunction
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
 
-# Up to this many vertices the inverse is kept as a dense matrix where a call to the host is dear:
+# Up to this many vertices the inverse is kept as a dense matrix where calls to the host are slow:
 # where there is an accelerator, or no FFI (ffi.py).
 DENSE_BELOW = 1000
 

@@ -15,9 +15,9 @@ caller who has the transposed matrix gives it instead. ``y = K x`` is half of th
     [ -K  I ] [y] = [0],
 
 and ``lax.custom_linear_solve`` takes a solver of this system and one of its transpose. It needs no
-private part of JAX, has forward and reverse mode of any order and vmap, and derives K too, from
-the residual of the system. XLA removes the padding (x, 0): the compiled program has the gathers
-and the large copies of the bare products (tests/linalg/test_ell.py). Beside a pair of primitives
+private part of JAX, has forward and reverse mode of any order and vmap, and derivatives to K too,
+from the residual of the system. XLA removes the padding (x, 0): the compiled program has the
+gathers and the large copies of the bare products (tests/linalg/test_ell.py). Beside a pair of primitives
 of our own (private parts of JAX, and no derivatives to K) the values are bitwise equal and the
 processor time is the same: K 4.2 and 4.3 ms, K^T 4.4 and 4.5 ms, a Hessian product 12.6 and
 12.9 ms, four of them under vmap 34.8 and 33.8 ms (50,298 vertices, 2 cores, a loaded machine).
@@ -40,7 +40,7 @@ WIDTHS = (8, 12, 16, 20, 24)
 """Slots of a row. One with more entries goes on in overflow rows of half as many slots: a pole of
 valence 40 must not widen all."""
 # Overflow rows for each row: always some, so that meshes with and without poles share the code.
-_PARTS = (0.125,)
+_FRACTIONS = (0.125,)
 # An overflow row is added by scatter, which costs about so many slots.
 _SCATTER = 24
 
@@ -151,8 +151,8 @@ class _Shape(NamedTuple):
     def of(length: Int[np.ndarray, "vertices"], width: int) -> "_Shape":
         shape = _Shape(width, max(width // 2, 1), 0)
         n = max(len(length), 1)
-        part = next_of(_PARTS, shape.overflows(length).sum() / n)
-        return shape._replace(rows=math.ceil(part * len(length)))
+        fraction = next_of(_FRACTIONS, shape.overflows(length).sum() / n)
+        return shape._replace(rows=math.ceil(fraction * len(length)))
 
     def overflows(self, length: Int[np.ndarray, "vertices"]) -> Int[np.ndarray, "vertices"]:
         """Return the number of overflow rows of each row."""
@@ -209,7 +209,7 @@ def multiply(
 
 @custom_vmap
 def _product(matrix: EllMatrix, x: Float[Array, "*lead in vertices batch"]):
-    """Return ``matrix @ x`` slot by slot, which nothing derives."""
+    """Return ``matrix @ x`` slot by slot; nothing differentiates it."""
     return _with_overflow(_product_of_slots, matrix, x)
 
 

@@ -54,7 +54,7 @@ def lowest_mode(
         alphas, betas = run.alphas.at[k].set(value), run.betas.at[k].set(beta)
         return run._replace(steps=k + 1, state=after, alphas=alphas, betas=betas, x=x)
 
-    def known(run: "_Run") -> Array:
+    def is_known(run: "_Run") -> Array:
         beta = run.state.beta
         error = beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
         sure = ~(2.0 * error >= jnp.abs(run.mu)) & (run.steps > 0)
@@ -65,22 +65,22 @@ def lowest_mode(
     nothing = _Run(at, begin, none, none, jnp.zeros_like(start), zero, none)
 
     def again(carried):
-        turn, old = carried
+        runs, old = carried
 
         def look(run: "_Run") -> "_Run":
             soon = jnp.minimum(run.steps + jnp.maximum(_LEAST, run.steps // 2), most)
-            until = jnp.where(turn == 0, soon, old.steps)
+            until = jnp.where(runs == 0, soon, old.steps)
             more = lambda run: (run.steps < until) & ((run.state.beta > 0.0) | (run.steps == 0))  # noqa: E731
             run = jax.lax.while_loop(more, partial(step, old.weights), run)
             mu, weights = _lowest(run.alphas, run.betas, run.steps)
             return run._replace(mu=mu, weights=weights)
 
-        ended = lambda run: jnp.where(turn == 0, known(run), run.steps >= old.steps)  # noqa: E731
-        return turn + 1, jax.lax.while_loop(lambda run: ~ended(run), look, nothing)
+        ended = lambda run: jnp.where(runs == 0, is_known(run), run.steps >= old.steps)  # noqa: E731
+        return runs + 1, jax.lax.while_loop(lambda run: ~ended(run), look, nothing)
 
     more = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
-    turn, run = jax.lax.while_loop(lambda x: wanted & more(x), again, (at, nothing))
-    return run.mu, jnp.where(turn == 2, run.x, 0.0)
+    runs, run = jax.lax.while_loop(lambda x: wanted & more(x), again, (at, nothing))
+    return run.mu, jnp.where(runs == 2, run.x, 0.0)
 
 
 class _State(NamedTuple):

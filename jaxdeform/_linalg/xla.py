@@ -28,7 +28,7 @@ def total(x: Float[Array, "*shape"], batch: int | None = None) -> Float[Array, "
 
 
 def without_fusion(always: Bool[Array, ""], otherwise, function, *arguments):
-    """Return ``function(*arguments)``, worked out once.
+    """Return ``function(*arguments)``, evaluated once.
 
     It is one branch of a ``cond`` that is always taken, which XLA cannot prove; ``otherwise`` has
     the shapes of the result. Without it XLA repeats the end of the function inside every
@@ -69,8 +69,8 @@ def quick_jit(
 
         @cache
         def at_top() -> Callable[..., Any]:
-            known = _known(tuple(options.items()))
-            return jax.jit(function, static_argnames=static, compiler_options=known)
+            taken = _taken(tuple(options.items()))
+            return jax.jit(function, static_argnames=static, compiler_options=taken)
 
         @wraps(function)
         def call(*arguments: Any, **settings: Any) -> Any:
@@ -88,7 +88,7 @@ def _is_at_top(arguments: tuple[Any, ...]) -> bool:
 
 
 @cache
-def _known(options: tuple[tuple[str, bool | int], ...]) -> dict[str, bool | int] | None:
+def _taken(options: tuple[tuple[str, bool | int], ...]) -> dict[str, bool | int] | None:
     chosen = dict(options)
     try:
         jax.jit(lambda x: x, compiler_options=chosen).lower(0.0).compile()

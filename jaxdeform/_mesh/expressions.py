@@ -135,13 +135,13 @@ class _Reader:
 
     def comparison(self) -> _Value:
         left = self.sum()
-        held, begin = None, left.begin
+        true, begin = None, left.begin
         while sign := self.take(*_COMPARE):
             right = self.sum()
             holds = _COMPARE[sign.text](self.number(left), self.number(right))
-            held = holds if held is None else held & holds
+            true = holds if true is None else true & holds
             left = right
-        return left if held is None else _Value(held, begin)
+        return left if true is None else _Value(true, begin)
 
     def sum(self) -> _Value:
         return self.chain(self.term, _SUM)

@@ -74,7 +74,7 @@ def cactus() -> Mesh:
 def octopus(vertices: int = 50_000) -> Mesh:
     """Return an octopus-like shape: a head and eight curled tentacles, y upwards.
 
-    **Arguments**: vertices, about how many it shall have (within 5 %).
+    **Arguments**: vertices, about how many it should have (within 5 %).
     **Raises** InputError below 5,000: the tentacles would break off.
 
     Example:

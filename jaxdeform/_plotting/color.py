@@ -71,9 +71,9 @@ class Scale(NamedTuple):
     def colors(self, values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3"]:
         """Return red, green and blue from 0 to 1; grey where there is no number."""
         place = self.place(values)
-        known = np.isfinite(place)
-        index = np.rint(np.where(known, place, 0) * (len(RAMP) - 1)).astype(int)
-        return np.where(known[..., None], RAMP[index], rgb(UNKNOWN))
+        finite = np.isfinite(place)
+        index = np.rint(np.where(finite, place, 0) * (len(RAMP) - 1)).astype(int)
+        return np.where(finite[..., None], RAMP[index], rgb(UNKNOWN))
 
     def bar(self, length: int) -> Float[np.ndarray, "length 3"]:
         """Return the colours from the lowest number to the highest."""
@@ -111,12 +111,12 @@ class Scale(NamedTuple):
 
 def scale_of(values: list[Float[np.ndarray, "vertices"]]) -> Scale | None:
     """Return a scale for all numbers; logarithmic if they are positive and differ 5 times."""
-    known = [v[np.isfinite(v)] for v in values]
-    known = [v for v in known if v.size]
-    if not known:
+    finite = [v[np.isfinite(v)] for v in values]
+    finite = [v for v in finite if v.size]
+    if not finite:
         return None
-    low, high = float(min(v.min() for v in known)), float(max(v.max() for v in known))
-    whole = all((v == np.rint(v)).all() for v in known) and high - low < 20
+    low, high = float(min(v.min() for v in finite)), float(max(v.max() for v in finite))
+    whole = all((v == np.rint(v)).all() for v in finite) and high - low < 20
     return Scale(low, high, log=0 < low < high / 5 and not whole, whole=whole)
 
 

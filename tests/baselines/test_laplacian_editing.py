@@ -246,3 +246,14 @@ def test_rotation_fit_on_rings_is_rc_arap(sheet):
         problem, targets, 0.0, local=jd.RotationFit(), solver=jd.Alternating(10), start=start
     )
     np.testing.assert_allclose(out.vertices, p, atol=1e-9)
+
+
+@pytest.mark.parametrize("similarity", [False, True])
+def test_far_from_the_origin_is_as_near(sheet, similarity):
+    """A million diagonals away, where a coordinate has ten digits left."""
+    shift = 1e6 * sheet.diagonal * np.array([1.0, -2.0, 0.5])
+    far = jd.Mesh(sheet.vertices + shift, sheet.faces)
+    targets = moved(sheet.vertices[HANDLES])
+    near = jd.laplacian_editing(sheet, HANDLES, targets, similarity=similarity)
+    out = jd.laplacian_editing(far, HANDLES, targets + shift, similarity=similarity)
+    np.testing.assert_allclose(np.asarray(out) - shift, near, atol=1e-8 * sheet.diagonal)

@@ -43,7 +43,7 @@ def work_off(
             if not isinstance(error, KilledWorker) or lost[block.key] > most:
                 raise jd.InputError(
                     f"{settings.run}: the run stopped ({type(error).__name__}: {error}). What is "
-                    "done is kept: mend it, and run the same command again"
+                    "done is kept: repair it, and run the same command again"
                 ) from error
             again = client.submit(run_block, block, settings, pure=False)
             of_future[again] = block

@@ -73,7 +73,7 @@ def read_manifest(path: Path) -> list[Job]:
     """Return the jobs of a CSV, JSON lines or Parquet file.
 
     **Raises** InputError naming the row and the column: an unknown column, a missing file or one
-    outside the manifest's folder, a value that is none, two jobs of one name.
+    outside the manifest's folder, a value that does not fit its column, two jobs of one name.
     """
     rows = list(_rows(path))
     if not rows:
@@ -81,10 +81,10 @@ def read_manifest(path: Path) -> list[Job]:
     folder = path.resolve().parent
     jobs: list[Job] = []
     seen: dict[str, int] = {}
-    known: dict[tuple[str, str], Any] = {}
+    read: dict[tuple[str, str], Any] = {}
     for number, row in enumerate(rows, 1):
         where = f"{path}: row {number}"
-        job = _job(where, number, row, folder, known)
+        job = _job(where, number, row, folder, read)
         if job.job in seen:
             raise jd.InputError(
                 f"{where}: the job {shown(job.job)} is in row {seen[job.job]} too: give each row "
@@ -127,9 +127,9 @@ def _object(path: Path, number: int, line: str) -> dict[str, Any]:
 
 
 def _job(
-    where: str, number: int, row: dict[str, Any], folder: Path, known: dict[tuple[str, str], Any]
+    where: str, number: int, row: dict[str, Any], folder: Path, read: dict[tuple[str, str], Any]
 ) -> Job:
-    """Return a checked row. `known` has what the rows above it held, which is mostly the same."""
+    """Return a checked row. `read` has what the rows above it held, which is mostly the same."""
     values: dict[str, Any] = {"job": str(number)}
     for column, value in row.items():
         if column not in _READERS:
@@ -138,12 +138,12 @@ def _job(
         blank = value is None or value == [] or (isinstance(value, str) and not value.strip())
         if not blank and not (isinstance(value, float) and math.isnan(value)):
             key = column, repr(value)
-            if key not in known:
+            if key not in read:
                 try:
-                    known[key] = _READERS[column](value, folder)
+                    read[key] = _READERS[column](value, folder)
                 except jd.InputError as error:
                     raise jd.InputError(f"{where}, {column}: {error}") from error
-            values[column] = known[key]
+            values[column] = read[key]
     if "mesh" not in values:
         raise jd.InputError(f"{where}: has no mesh: name its file")
     job = Job(**values)
