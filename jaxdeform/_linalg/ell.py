@@ -17,9 +17,9 @@ caller who has the transposed matrix gives it instead. ``y = K x`` is half of th
 and ``lax.custom_linear_solve`` takes a solver of this system and one of its transpose. It needs no
 private part of JAX, has forward and reverse mode of any order and vmap, and derivatives to K too,
 from the residual of the system. XLA removes the padding (x, 0): the compiled program has the
-gathers and the large copies of the bare products (tests/linalg/test_ell.py). Beside a pair of primitives
-of our own (private parts of JAX, and no derivatives to K) the values are bitwise equal and the
-processor time is the same: K 4.2 and 4.3 ms, K^T 4.4 and 4.5 ms, a Hessian product 12.6 and
+gathers and the large copies of the bare products (tests/linalg/test_ell.py). Beside a pair of
+primitives of our own (private parts of JAX, and no derivatives to K) the values are bitwise equal
+and the processor time is the same: K 4.2 and 4.3 ms, K^T 4.4 and 4.5 ms, a Hessian product 12.6 and
 12.9 ms, four of them under vmap 34.8 and 33.8 ms (50,298 vertices, 2 cores, a loaded machine).
 """
 

@@ -153,3 +153,24 @@ def test_every_cell_of_the_real_meshes(real_cells, dtype, way):
         # float32 Newton ends above its tolerance in 62 of them, nearly flat and stiff ones.
         found = {local: solutions[local][k] for local in MATERIAL}
         check_minima(found, *chunk, agreement=0.998 if dtype == np.float64 else 0.99)
+
+
+@pytest.mark.slow
+def test_the_reference_solves_a_bar_turned_at_one_end():
+    """One flat cell of it was NaN after the second iteration, and all others after the third."""
+    if not (REAL / "bar1.off").exists():
+        pytest.skip(f"needs {REAL.parent.name}/{REAL.name} beside the project")
+    mesh = jd.load_mesh(REAL / "bar1.off")
+    vertices = mesh.vertices * (4.5 / np.ptp(mesh.vertices, axis=0).max())
+    mesh = jd.Mesh(vertices, mesh.faces)
+    along = int(np.argmax(np.ptp(vertices, axis=0)))
+    at = (vertices[:, along] - vertices[:, along].min()) / np.ptp(vertices[:, along])
+    handles = np.flatnonzero((at < 0.05) | (at > 0.95))
+    turned = jd.rotate(vertices[handles], 90.0, axis="xyz"[along - 1], center=mesh.center)
+    targets = np.where(at[handles, None] > 0.95, turned, vertices[handles])
+    problem = jd.precompute(mesh, handles)
+    ends = [
+        jd.deform(problem, targets, 0.3, local=local, solver=jd.Alternating(3)).vertices
+        for local in (jd.LBFGS(), jd.Newton())
+    ]
+    np.testing.assert_allclose(*ends, atol=1e-6)

@@ -168,6 +168,18 @@ def interrupted(file: Path, kind: int) -> None:
     jd.estimate_rigidity(made, pose, solver=jd.Alternating(1_000_000))
 
 
+def sent_to_dask(file: Path) -> None:
+    """Deform on a Dask worker: a process with a thread for the work."""
+    from dask.distributed import Client, LocalCluster
+
+    os.environ["JAX_ENABLE_X64"] = "1"  # the worker inherits it
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        np.save(file, client.submit(deformed, problem()).result())
+
+
 def large(file: Path, size: int = 30_000, times: int = 1) -> None:
     """Deform a large mesh, several times."""
     made = problem(size)

@@ -77,10 +77,11 @@ def test_ctrl_c_is_heard_while_jax_computes(run, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["spawned", "forked", "cloudpickled"])
+@pytest.mark.parametrize("task", ["spawned", "forked", "cloudpickled", "sent_to_dask"])
 def test_a_problem_in_another_process_is_itself(task, run, expected):
-    if task == "cloudpickled" and importlib.util.find_spec("cloudpickle") is None:
-        pytest.skip("needs cloudpickle")
+    needs = {"cloudpickled": "cloudpickle", "sent_to_dask": "distributed"}.get(task)
+    if needs and importlib.util.find_spec(needs) is None:
+        pytest.skip(f"needs {needs}")
     if task == "forked" and not hasattr(os, "fork"):
         pytest.skip("this system has no fork")
     np.testing.assert_array_equal(run(task), expected)
