@@ -106,8 +106,10 @@ def of_own_format(source: Source | None, found: Extras) -> list[str]:
         used = Counter(obj_keywords(data))
         groups = ["groups"] if used[b"g"] + used[b"o"] > 1 else []  # one is the whole mesh
         materials = ["materials"] if used[b"usemtl"] else []
-        some = found.colors is None and any(obj_words(data))
-        return [*groups, *materials, *(["colours of some vertices"] if some else [])]
+        some = ["colours of some vertices"] if found.colors is None and any(obj_words(data)) else []
+        lines = ["lines"] if used[b"l"] else []
+        points = ["points"] if used[b"p"] else []
+        return [*groups, *materials, *some, *lines, *points]
     if source.suffix == ".off":
         return ["colours of faces"] if has_face_colors(data) else []
     if source.suffix == ".ply":

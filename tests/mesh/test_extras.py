@@ -164,6 +164,7 @@ ONE_FORMAT = {
         "groups and materials",
     ),
     "some.obj": ("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "colours of some vertices"),
+    "lines.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\np 3\n", "lines and points"),
     "m.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 255 0 0\n", "colours of faces"),
     "m.ply": (PLY, "vertex quality and face red"),
 }
