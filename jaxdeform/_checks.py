@@ -217,15 +217,19 @@ def read_axis(name: str, axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
     return vector / np.linalg.norm(vector)
 
 
+def check_one_per_handle(weights: Any, shape: tuple[int, ...]) -> Any:
+    """Return the weights, or raise InputError: not one number, nor as many as there are handles."""
+    if weights.shape not in ((), shape):
+        raise InputError(
+            f"handle_weights have shape {weights.shape}: give one number or one per handle, {shape}"
+        )
+    return weights
+
+
 def check_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     """Return one weight per handle, infinite for a hard handle, or raise InputError."""
     given = read_host_array(weights, np.float64, "handle_weights")
-    if given.ndim and given.shape != index.shape:
-        raise InputError(
-            f"handle_weights have shape {given.shape}: give one number or one per handle, "
-            f"{index.shape}"
-        )
-    given = np.broadcast_to(given, index.shape)
+    given = np.broadcast_to(check_one_per_handle(given, index.shape), index.shape)
     bad = np.flatnonzero(~(given >= 0))
     if bad.size:
         raise InputError(

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import (
     check_flag,
+    check_one_per_handle,
     check_rigidity,
     read_host_positions,
     read_positions,
@@ -120,12 +121,7 @@ def read_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "v
     if weights is None:
         return system.soft
     given = as_array(weights, problem.dtype, "handle_weights")
-    if given.shape not in ((), handles.shape):
-        raise InputError(
-            f"handle_weights have shape {given.shape}: give one number or one per handle, "
-            f"{handles.shape}"
-        )
-    given = jnp.broadcast_to(given, handles.shape)
+    given = jnp.broadcast_to(check_one_per_handle(given, handles.shape), handles.shape)
     given = jnp.where(system.free[handles], given, 0.0)
     if is_concrete(given, system.soft):
         most = np.asarray(system.soft)[np.asarray(handles)]

@@ -28,7 +28,8 @@ class QuasiNewton:
     raise it. An iteration costs about as much as an alternating one, and far fewer are needed. On
     the bar of rigidity 1, 41 come within 1e-4 of the minimum where alternating takes 145.
 
-    Nocedal, "Updating quasi-Newton matrices with limited storage", 1980.
+    Nocedal, "Updating quasi-Newton matrices with limited storage" (1980),
+    doi:10.1090/S0025-5718-1980-0572855-7.
 
     **Fields**
 

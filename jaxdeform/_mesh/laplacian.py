@@ -1,6 +1,7 @@
 """Cotangent weights and the weighted graph Laplacian (thesis Sec. 2.4).
 
-What is done about negative weights stands in bounded.py.
+What the energy does about negative weights stands in bounded.py; `normalised_laplacian`, which
+divides by their sum, bounds that sum itself.
 """
 
 import igl

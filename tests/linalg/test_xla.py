@@ -10,8 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdeform._deformation.cell_newton import _diagonal_start
 from jaxdeform._deformation.material_derivative import material_with_derivative
-from jaxdeform._linalg.xla import after_reads, total, without_fusion
+from jaxdeform._linalg.rotations import polar_rotation
+from jaxdeform._linalg.small_matrices import as_grid
+from jaxdeform._linalg.xla import AS_FAST, QUICK, _taken, after_reads, total, without_fusion
 
 
 def compiled(function, *arguments) -> str:
@@ -115,6 +118,20 @@ def test_after_reads_refuses_what_is_not_finite():
     reads = jnp.array([1.0, jnp.nan, jnp.inf, 2.0])
     condition = jnp.array([True, True, True, False])
     np.testing.assert_array_equal(after_reads(condition, reads), [True, False, False, False])
+
+
+def test_short_loops_stay_loops():
+    """Unrolled, their steps would be repeated for each of the nine entries that follow."""
+    c, b, lam = jnp.tile(jnp.eye(3)[..., None], 5), list(jnp.ones((3, 5))), jnp.ones(5)
+    assert computations_with(compiled(polar_rotation, c), "while")
+    start = lambda c, b, lam: _diagonal_start(as_grid(c), b, lam)  # noqa: E731
+    assert computations_with(compiled(start, c, b, lam), "while")
+
+
+@pytest.mark.parametrize("options", [AS_FAST, QUICK], ids=["as fast", "quick"])
+def test_the_compiler_still_knows_the_options_of_quick_jit(options):
+    """Without them programs are right, and compile for longer."""
+    assert _taken(tuple(options.items())) == options
 
 
 def test_the_solution_of_the_cells_is_worked_out_once():
