@@ -37,13 +37,15 @@ class _Equations(eqx.Module):
 
 
 @jax.jit
-def _solve(equations: _Equations, led: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+def _solve(
+    equations: _Equations, center: Float[Array, "3"], led: Float[Array, "3 vertices"]
+) -> Float[Array, "3 vertices"]:
     """Return the edited positions, given positions that have the handles on their targets."""
-    x = led.reshape(equations.pull.shape)
+    x = (led - center[:, None]).reshape(equations.pull.shape)
     fixed = jnp.where(equations.free[None], 0.0, x)
     right = equations.pull + equations.soft[None] * x - equations.normal.apply(fixed)
     solution = equations.factor.solve(jnp.where(equations.free[None], right, 0.0))
-    return (fixed + solution).reshape(led.shape)
+    return (fixed + solution).reshape(led.shape) + center[:, None]
 
 
 class LaplacianEditor(eqx.Module):
@@ -72,9 +74,9 @@ class LaplacianEditor(eqx.Module):
             led[np.asarray(self.handles)] = targets
         else:
             led = self.rest.at[self.handles].set(targets)
-        led = fill_up((led - self.center[None]).T, self.equations.pull.size // 3)
-        moved = cut(_solve(self.equations, jnp.asarray(led)).T, len(self.rest), 0)
-        return moved + self.center[None]
+        led = fill_up(led.T, self.equations.pull.size // 3)
+        moved = _solve(self.equations, self.center, jnp.asarray(led))
+        return cut(moved.T, len(self.rest), 0)
 
 
 def laplacian_editor(
