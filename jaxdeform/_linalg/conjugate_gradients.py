@@ -5,10 +5,11 @@ zeros never passes, and take no norm of the preconditioner.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 # One vector, of any shape.
 Vectors = Float[Array, "..."]
@@ -33,22 +34,30 @@ def conjugate_gradients(
     size = dot(right, z)
     goal = tolerance**2 * size
 
-    def step(state):
-        count, x, r, p, square = state
-        hp = multiply(p)
-        alpha = square / dot(p, hp)
-        r = r - alpha * hp
-        z = precondition(r)
-        new = dot(r, z)
-        return count + 1, x + alpha * p, r, z + (new / square) * p, new
+    def step(at: _State) -> _State:
+        product = multiply(at.direction)
+        alpha = at.square / dot(at.direction, product)
+        residual = at.residual - alpha * product
+        z = precondition(residual)
+        square = dot(residual, z)
+        direction = z + (square / at.square) * at.direction
+        return _State(at.steps + 1, at.x + alpha * at.direction, residual, direction, square)
 
-    def unsolved(state):
-        count, *_, square = state
-        return (square > goal) & (count < max_steps)  # NaN fails the comparison
+    def unsolved(at: _State) -> Bool[Array, ""]:
+        return (at.square > goal) & (at.steps < max_steps)  # NaN fails the comparison
 
-    begin = jnp.zeros((), jnp.int32), jnp.zeros_like(right), right, z, size
-    _, x, _, _, square = jax.lax.while_loop(unsolved, step, begin)
-    return x, jnp.sqrt(square / jnp.where(size > 0, size, 1.0))
+    begin = _State(jnp.zeros((), jnp.int32), jnp.zeros_like(right), right, z, size)
+    end = jax.lax.while_loop(unsolved, step, begin)
+    return end.x, jnp.sqrt(end.square / jnp.where(size > 0, size, 1.0))
+
+
+class _State(NamedTuple):
+    steps: Int[Array, ""]
+    x: Vectors
+    residual: Vectors
+    direction: Vectors
+    square: Float[Array, ""]
+    """The square of the residual's size."""
 
 
 def dot(u: Vectors, v: Vectors) -> Float[Array, ""]:

@@ -171,6 +171,16 @@ class _Slots(NamedTuple):
     """True where two steps in a row were refused."""
 
 
+class _Queue(NamedTuple):
+    """``member`` is in each slot (beyond the last one, idle); ``following`` has no slot yet."""
+
+    tick: Int[Array, ""]
+    member: Int[Array, "slots"]
+    following: Int[Array, ""]
+    work: _Slots
+    out: Minimum
+
+
 def _run_queue(function, system, inputs, start, settings: Settings) -> Minimum:
     count = start.shape[0]
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
@@ -182,28 +192,28 @@ def _run_queue(function, system, inputs, start, settings: Settings) -> Minimum:
     work = _restart(work, jnp.ones(slots, bool), work.p)
     member = jnp.arange(slots, dtype=jnp.int32)
 
-    def finish_some(state):
+    def finish_some(queue: _Queue) -> _Queue:
         """Iterate until a member is done; store its result and start the next one."""
-        tick, member, following, work, out = state
+        member = queue.member
         own = jax.tree.map(lambda x: x.at[member].get(mode="clip"), inputs)
         advance = partial(_advance, function, system, own, settings)
         idle = member >= count
-        tick, work = jax.lax.while_loop(
-            lambda s: ~jnp.any(_done(s[1], settings) & ~idle), lambda s: advance(*s), (tick, work)
-        )
+        busy = lambda s: ~jnp.any(_done(s[1], settings) & ~idle)  # noqa: E731
+        tick, work = jax.lax.while_loop(busy, lambda s: advance(*s), (queue.tick, queue.work))
         done = _done(work, settings) & ~idle
         ended = work.stalled | _converged(work, settings)
         transforms = jnp.moveaxis(work.at.transforms, -1, 0)
         found = Minimum(work.p, transforms, work.history, work.iteration - 1, ended)
-        place = jnp.where(done, member, count)
-        out = jax.tree.map(lambda all_, new: all_.at[place].set(new, mode="drop"), out, found)
-        member = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, member)
+        place, rank = jnp.where(done, member, count), jnp.cumsum(done, dtype=jnp.int32)
+        store = lambda all_, new: all_.at[place].set(new, mode="drop")  # noqa: E731
+        out = jax.tree.map(store, queue.out, found)
+        member = jnp.where(done, queue.following + rank - 1, member)
         # A slot without a next member stays at its solution, where a step costs the least.
         work = _restart(work, done & (member < count), start.at[member].get(mode="clip"))
-        return tick, member, following + jnp.sum(done, dtype=jnp.int32), work, out
+        return _Queue(tick, member, queue.following + rank[-1], work, out)
 
-    begin = (jnp.zeros((), jnp.int32), member, jnp.asarray(slots, jnp.int32), work, out)
-    return jax.lax.while_loop(lambda s: jnp.any(s[1] < count), finish_some, begin)[-1]
+    begin = _Queue(jnp.zeros((), jnp.int32), member, jnp.asarray(slots, jnp.int32), work, out)
+    return jax.lax.while_loop(lambda q: jnp.any(q.member < count), finish_some, begin).out
 
 
 def _empty(p: Float[Array, "slots 3 vertices"], settings: Settings) -> _Slots:
