@@ -1,5 +1,7 @@
 """What tests share: named tolerances, meshes, settings and small measures."""
 
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +108,14 @@ def bumpy_sheet() -> jd.Mesh:
     low = (np.arange(7)[None] + 8 * np.arange(6)[:, None]).ravel()
     faces = [np.stack([low, low + 1, low + 9], 1), np.stack([low, low + 9, low + 8], 1)]
     return jd.Mesh(np.stack([x, y, z], -1).reshape(-1, 3), np.concatenate(faces))
+
+
+ONE_CPU = pytest.mark.skipif(shutil.which("taskset") is None, reason="needs taskset")
+
+
+def one_cpu() -> tuple[str, ...]:
+    """Return the words before a command that give it one CPU."""
+    return "taskset", "-c", str(min(os.sched_getaffinity(0)))
 
 
 def held_sheet():

@@ -1,6 +1,7 @@
 """The materials of docs/derivatives.md are minima, and their derivatives are right."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -69,28 +70,41 @@ def test_derivatives_of_the_corotated_minimum(cells):
     difference = (law.minimize(*at(1e-5)) - law.minimize(*at(-1e-5))) / 2e-5
     np.testing.assert_allclose(slope, difference, rtol=FD, atol=FD * float(jnp.abs(slope).max()))
 
+    def value(s):
+        known = jax.lax.stop_gradient(law.minimize(*at(s)))
+        return law.with_implicit_derivative(known, *at(s))
+
+    curvature = jax.jacfwd(jax.jacfwd(value))(0.0)
+    difference = (jax.jacfwd(value)(1e-5) - jax.jacfwd(value)(-1e-5)) / 2e-5
+    scale = float(jnp.abs(curvature).max())
+    np.testing.assert_allclose(curvature, difference, rtol=FD, atol=FD * scale)
+
 
 def laws() -> dict:
     """Return, for each law of the page: how it is solved, and what gives that the derivatives."""
     volume = block("volume")
-    price, data_of = volume["price"], jax.lax.stop_gradient
+    price = volume["price"]
 
     def solve(c, b, rigidity):
         t = jd.RotationFit().minimize(c, b, rigidity)
-        step = jax.vmap(lambda t, *cell: newton(price, t, *cell), in_axes=-1, out_axes=-1)
-        return jax.lax.fori_loop(0, 30, lambda _, t: step(t, c, b, rigidity), t)
+        return jax.lax.fori_loop(0, 30, lambda _, t: newton(price, t, c, b, rigidity), t)
 
     corotated = block("corotated", until="mesh =")["Corotated"]()
     return {
         "corotated": (corotated.minimize, corotated.with_implicit_derivative),
-        "volume": (solve, lambda t, *data: volume["known_minimum_of"](price, data_of(t), *data)),
+        "volume": (solve, partial(volume["known_minimum_of"], price)),
     }
 
 
 def newton(price, t, *data):
+    """Take one step of Newton's method in every cell."""
     slope = jax.grad(price)
-    hessian = jax.jacfwd(slope)(t, *data).reshape(9, 9)
-    return t - jnp.linalg.solve(hessian, slope(t, *data).reshape(9)).reshape(3, 3)
+
+    def one_cell(t, *data):
+        hessian = jax.jacfwd(slope)(t, *data).reshape(9, 9)
+        return t - jnp.linalg.solve(hessian, slope(t, *data).reshape(9)).reshape(3, 3)
+
+    return jax.vmap(one_cell, in_axes=-1, out_axes=-1)(t, *data)
 
 
 @pytest.mark.slow
@@ -124,8 +138,7 @@ def test_the_general_rule_agrees_with_the_one_of_newton(cells):
         return names["price"](t, c, b, rigidity, bulk=0.0)
 
     # To the last digit: a derivative of two Newton steps notices what is left of the gradient.
-    exact = jax.vmap(lambda t, *cell: newton(price, t, *cell), in_axes=-1, out_axes=-1)
-    t = exact(jd.Newton().minimize(*cells), *cells)
+    t = newton(price, jd.Newton().minimize(*cells), *cells)
     changes = (jnp.zeros_like(t), *(jnp.ones_like(x) for x in cells))
     general = lambda *data: names["known_minimum_of"](price, *data)  # noqa: E731
     _, one = jax.jvp(general, (t, *cells), changes)

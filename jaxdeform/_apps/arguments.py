@@ -1,5 +1,6 @@
 """What the command line is given: poses, parts, a rigidity, a folder."""
 
+import os
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -83,7 +84,7 @@ def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     try:
         values = np.asarray(real(text.encode(errors="replace")))
     except ValueError:
-        if not _exists(text):
+        if not os.path.exists(text):  # False too for a name that no file can have
             raise jd.InputError(
                 f"--rigidity {text}: is neither a number nor a file: give a number or a PLY file"
             ) from None
@@ -93,13 +94,6 @@ def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     except jd.InputError as error:
         raise jd.InputError(f"--rigidity {text}: {error}") from error
     return values
-
-
-def _exists(name: str) -> bool:
-    try:
-        return Path(name).exists()
-    except OSError:  # a name that no file can have
-        return False
 
 
 def make_folder(folder: Path) -> None:

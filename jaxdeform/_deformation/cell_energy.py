@@ -16,7 +16,9 @@ from jaxdeform._linalg.small_matrices import (
     Vectors,
     minus_identity,
     product,
+    product_of_arrays,
     transpose,
+    transpose_of_array,
 )
 
 
@@ -59,7 +61,7 @@ def half_hessian(t: Matrices, b: Vectors, lam: Scalars) -> Blocks:
     Its blocks are those of the rows of T.
     """
     unit = jnp.eye(3, dtype=t.dtype)[..., None]
-    gram = sum(t[k, :, None] * t[k, None] for k in (1, 2)) + t[0, :, None] * t[0, None]
+    gram = product_of_arrays(transpose_of_array(t), t)
     twice = 2.0 * lam[None, None]
 
     def block(i: int, k: int) -> Matrices:

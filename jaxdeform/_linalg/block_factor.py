@@ -5,6 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxdeform._linalg.small_matrices import Matrices, Scalars, Vectors, from_grid
+from jaxdeform._linalg.small_matrices import product_of_arrays as product
+from jaxdeform._linalg.small_matrices import times_vectors as times
+from jaxdeform._linalg.small_matrices import transpose_of_array as transpose
 
 Blocks = tuple[tuple[Matrices], tuple[Matrices, Matrices], tuple[Matrices, Matrices, Matrices]]
 """The lower triangle, row by row."""
@@ -34,12 +37,12 @@ class BlockFactor(NamedTuple):
         """Factor; a pivot below ``floor`` (a direction without stiffness) becomes ``floor``."""
         (h11,), (h21, h22), (h31, h32, h33) = matrix
         t1, d1 = _eliminated(h11, floor)
-        w21, w31 = (_product(h, _transpose(t1)) for h in (h21, h31))
+        w21, w31 = (product(h, transpose(t1)) for h in (h21, h31))
         l21, l31 = w21 / d1[None], w31 / d1[None]
-        t2, d2 = _eliminated(h22 - _product(l21, _transpose(w21)), floor)
-        w32 = _product(h32 - _product(l31, _transpose(w21)), _transpose(t2))
+        t2, d2 = _eliminated(h22 - product(l21, transpose(w21)), floor)
+        w32 = product(h32 - product(l31, transpose(w21)), transpose(t2))
         l32 = w32 / d2[None]
-        last = h33 - _product(l31, _transpose(w31)) - _product(l32, _transpose(w32))
+        last = h33 - product(l31, transpose(w31)) - product(l32, transpose(w32))
         t3, d3 = _eliminated(last, floor)
         return BlockFactor((l21, l31, l32), (t1, t2, t3), (d1, d2, d3))
 
@@ -47,13 +50,13 @@ class BlockFactor(NamedTuple):
         """Return x with H x = right, both (block, entry of the block, cell)."""
         (l21, l31, l32), (t1, t2, t3), (d1, d2, d3) = self
         a, b, c = right
-        a = _times(t1, a)
-        b = _times(t2, b - _times(l21, a))
-        c = _times(t3, c - _times(l31, a) - _times(l32, b))
-        c = _times(_transpose(t3), c / d3)
-        b = _times(_transpose(t2), b / d2 - _times(_transpose(l32), c))
-        a = a / d1 - _times(_transpose(l21), b) - _times(_transpose(l31), c)
-        return jnp.stack([_times(_transpose(t1), a), b, c])
+        a = times(t1, a)
+        b = times(t2, b - times(l21, a))
+        c = times(t3, c - times(l31, a) - times(l32, b))
+        c = times(transpose(t3), c / d3)
+        b = times(transpose(t2), b / d2 - times(transpose(l32), c))
+        a = a / d1 - times(transpose(l21), b) - times(transpose(l31), c)
+        return jnp.stack([times(transpose(t1), a), b, c])
 
 
 def _eliminated(matrix: Matrices, floor: Scalars) -> tuple[Matrices, Vectors]:
@@ -68,15 +71,3 @@ def _eliminated(matrix: Matrices, floor: Scalars) -> tuple[Matrices, Vectors]:
     zero, one = jnp.zeros_like(p0), jnp.ones_like(p0)
     rows = [[one, zero, zero], [-l10, one, zero], [l10 * l21 - l20, -l21, one]]
     return from_grid(rows), jnp.stack([p0, p1, p2])
-
-
-def _transpose(x: Matrices) -> Matrices:
-    return jnp.swapaxes(x, 0, 1)
-
-
-def _product(x: Matrices, y: Matrices) -> Matrices:
-    return x[:, 0, None] * y[None, 0] + x[:, 1, None] * y[None, 1] + x[:, 2, None] * y[None, 2]
-
-
-def _times(x: Matrices, v: Vectors) -> Vectors:
-    return x[:, 0] * v[0][None] + x[:, 1] * v[1][None] + x[:, 2] * v[2][None]

@@ -1,4 +1,4 @@
-"""Algebra of 3x3 matrices by components, over all cells at once."""
+"""Algebra of 3x3 matrices over all cells at once, by components and as whole arrays."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -53,3 +53,18 @@ def cross(u: list[Array], v: list[Array]) -> list[Array]:
         u[2] * v[0] - u[0] * v[2],
         u[0] * v[1] - u[1] * v[0],
     ]
+
+
+# Of whole arrays: a product of blocks is then a few operations for the compiler, not 45.
+
+
+def transpose_of_array(x: Matrices) -> Matrices:
+    return jnp.swapaxes(x, 0, 1)
+
+
+def product_of_arrays(x: Matrices, y: Matrices) -> Matrices:
+    return x[:, 0, None] * y[None, 0] + x[:, 1, None] * y[None, 1] + x[:, 2, None] * y[None, 2]
+
+
+def times_vectors(x: Matrices, v: Vectors) -> Vectors:
+    return x[:, 0] * v[0][None] + x[:, 1] * v[1][None] + x[:, 2] * v[2][None]

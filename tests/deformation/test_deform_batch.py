@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import ONE_CPU, one_cpu
 
 import jaxdeform as jd
 
@@ -101,14 +101,10 @@ def test_what_does_not_fit_together_is_named(plate):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cpus", ["all", "one"])
+@pytest.mark.parametrize("cpus", ["all", pytest.param("one", marks=ONE_CPU)])
 def test_eight_devices(alone, tmp_path, cpus):
     """More devices than CPUs: no hang, and the same shapes."""
-    before = ()
-    if cpus == "one":
-        if shutil.which("taskset") is None:
-            pytest.skip("needs taskset")
-        before = ("taskset", "-c", str(min(os.sched_getaffinity(0))))
+    before = one_cpu() if cpus == "one" else ()
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=8"
     subprocess.run(
         [*before, sys.executable, CHILD, tmp_path / "8.npz"],

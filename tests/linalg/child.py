@@ -165,7 +165,7 @@ def interrupted(file: Path, kind: int) -> None:
     if kind == 2:
         path = jd.bend(made.vertices[np.asarray(made.handles)], 60.0)[None]
         jd.deform_path(made, path, 0.1, solver=endless, progress=print)
-    jd.estimate_rigidity(made, pose, solver=jd.Alternating(1_000_000))
+    jd.estimate_rigidity(made, pose, solver=endless)
 
 
 def sent_to_dask(file: Path) -> None:

@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import ONE_CPU, one_cpu
 
 CHILD = Path(__file__).with_name("child.py")
-ONE_CPU = pytest.mark.skipif(shutil.which("taskset") is None, reason="needs taskset")
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +89,14 @@ def test_a_problem_in_another_process_is_itself(task, run, expected):
 @pytest.mark.slow
 @pytest.mark.parametrize("cpus", ["all", pytest.param("one", marks=ONE_CPU)])
 def test_eight_threads(cpus, run, expected):
-    before = ("taskset", "-c", _one_cpu()) if cpus == "one" else ()
+    before = one_cpu() if cpus == "one" else ()
     np.testing.assert_array_equal(run("threads", before=before), expected)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cpus", ["all", pytest.param("one", marks=ONE_CPU)])
 def test_eight_devices(cpus, run, expected):
-    before = ("taskset", "-c", _one_cpu()) if cpus == "one" else ()
+    before = one_cpu() if cpus == "one" else ()
     flags = "--xla_force_host_platform_device_count=8"
     np.testing.assert_allclose(run("devices", before=before, XLA_FLAGS=flags), expected, atol=1e-10)
 
@@ -107,8 +106,4 @@ def test_eight_devices(cpus, run, expected):
 @pytest.mark.parametrize(("size", "times"), [(30_000, 5), (200_000, 1)])
 def test_one_cpu_is_enough(size, times, run):
     """A callback would now and then wait for ever for the thread that it occupies."""
-    assert np.all(np.isfinite(run("large", size, times, before=("taskset", "-c", _one_cpu()))))
-
-
-def _one_cpu() -> str:
-    return str(min(os.sched_getaffinity(0)))
+    assert np.all(np.isfinite(run("large", size, times, before=one_cpu())))

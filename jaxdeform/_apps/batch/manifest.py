@@ -108,8 +108,9 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
     elif suffix == ".parquet":
         import pyarrow.parquet
 
+        data = io.BytesIO(read_bytes(path))
         try:
-            yield from pyarrow.parquet.read_table(io.BytesIO(read_bytes(path))).to_pylist()
+            yield from pyarrow.parquet.read_table(data).to_pylist()
         except (OSError, ValueError) as error:
             raise jd.InputError(f"{path}: is no Parquet file ({error}): write it again") from error
     else:
