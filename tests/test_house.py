@@ -239,3 +239,11 @@ print(*[x for x in {heavy} if x in sys.modules])
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert run.stdout.split() == []
+
+
+def test_no_import_changes_the_process():
+    child = Path(__file__).with_name("import_child.py")
+    run = subprocess.run([sys.executable, child], capture_output=True, text=True, check=True)
+    modules, changed = run.stdout.splitlines()
+    assert int(modules.split()[0]) > 100
+    assert changed == "[]"

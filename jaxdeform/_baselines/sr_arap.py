@@ -18,7 +18,7 @@ from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import (
     Solution,
     cut_to_mesh,
-    first_guess,
+    guess_at_once,
     solution_of,
     without_derivative,
 )
@@ -99,6 +99,8 @@ def sr_arap(
     inputs = read_inputs(problem, relative, 0.0, None)
     if start is not None:
         start = read_shape(problem, "start", start)
+    else:
+        start = guess_at_once(problem.system, inputs.targets)
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
     how = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
     out = cut_to_mesh(_solve_at_once(energy, inputs, start, **how), problem.n_vertices)
@@ -108,7 +110,7 @@ def sr_arap(
 def _solve(
     energy: SmoothEnergy,
     inputs: Inputs,
-    start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
+    start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"],
     *,
     tolerance: float,
     max_steps: int,
@@ -116,8 +118,6 @@ def _solve(
 ) -> Solution:
     energy = energy._replace(system=without_derivative(energy.system))
     system, targets = energy.system, inputs.targets
-    if start is None:
-        start = first_guess(system, targets)
     start = jnp.where(system.free[None], start, targets)
     if steps is None:
         known = jax.lax.stop_gradient((energy, start))

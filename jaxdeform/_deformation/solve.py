@@ -166,8 +166,8 @@ def deform(
                 "rest and edge_weights are differentiated by Implicit() only: give "
                 "adjoint=jd.Implicit()"
             )
-    if start is None:  # a program of its own, so that a start given later compiles nothing anew
-        start = _guess_at_once(problem.system, inputs.targets)
+    if start is None:
+        start = guess_at_once(problem.system, inputs.targets)
     out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, how), problem.n_vertices)
     return check_result(out, throw)
 
@@ -242,9 +242,10 @@ def first_guess(system: System, targets: Float[Array, "3 vertices"]) -> Float[Ar
 
 
 @quick_jit(static=())
-def _guess_at_once(
+def guess_at_once(
     system: System, targets: Float[Array, "3 vertices"]
 ) -> Float[Array, "3 vertices"]:
+    """Return the first guess by a program of its own: a start given later compiles nothing anew."""
     return first_guess(without_derivative(system), targets)
 
 

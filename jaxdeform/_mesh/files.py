@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxdeform._arrays import read_host_array, read_only
+from jaxdeform._arrays import read_host_array
 from jaxdeform._checks import check_rigidity, check_type, read_path
 from jaxdeform._errors import ArrayLike, InputError, printable
 from jaxdeform._mesh.extras import file_extras, of_own_format
@@ -255,7 +255,7 @@ def read_arrays(path: Path) -> FileArrays:
             f"{path}: face {polygons.sizes.argmax()} has {largest} corners: cut it into triangles "
             "in a modeller; here that would take too long"
         )
-    source = Source(suffix, data, polygons, trailing, read_only(points), path.absolute())
+    source = Source(suffix, data, polygons, trailing, points, path.absolute())
     return FileArrays(points, triangles(points, polygons), source)
 
 

@@ -1,12 +1,13 @@
 """What a reader of files returns, and what a mesh remembers of its file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxdeform._arrays import read_only
 from jaxdeform._mesh.polygons import Polygons
 
 
@@ -44,6 +45,15 @@ class Source:
     """The positions in the file."""
     path: Path
     """Where it was, for the files that it names."""
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for array in (*self.polygons, self.points):
+            read_only(array)
+
+    def __reduce__(self):
+        """Pickle the content; loading freezes it again."""
+        return Source, tuple(getattr(self, field.name) for field in fields(self))
 
     def fits(self, n_vertices: int, faces: Int[np.ndarray, "faces 3"]) -> bool:
         """Return whether a mesh is of this file: the polygons, cut in any way, at any positions."""

@@ -230,6 +230,24 @@ def test_nothing_of_a_file_reaches_the_terminal_unescaped(tmp_path):
         assert len(str(error.value)) <= 1000
 
 
+def test_nothing_of_a_file_reaches_the_terminal_unescaped_in_a_warning(tmp_path, recwarn):
+    """What another format cannot hold is named as the file names it."""
+    evil = "\x1b]0;title\x07\x9b31m\u202e"
+    files = {
+        "m.ply": f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        f"property float z\nproperty float {evil}\nelement face 1\nproperty list uchar int "
+        f"vertex_indices\nproperty int {evil}\nelement {evil} 1\nproperty int a\nend_header\n"
+        "0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2 7\n5\n",
+        "m.obj": f"v 0 0 0\nv 1 0 0\nv 0 1 0\ng {evil}\no {evil}\nusemtl {evil}\nf 1 2 3\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        jd.save_mesh(tmp_path / f"{name}.off", jd.load_mesh(tmp_path / name))
+    assert len(recwarn.list) == len(files)
+    for warning in recwarn.list:
+        assert str(warning.message).isprintable()
+
+
 def test_stl_says_what_single_precision_loses(tmp_path):
     """At 5e5, float32 steps by 1/32."""
     path = tmp_path / "m.stl"
