@@ -1,7 +1,8 @@
 """Read arrays, or raise an InputError that names the argument, the reason, and the next move.
 
-All arrays of all public functions come in here: as NumPy's by `read_numbers`, or also as
-JAX's by `read_array`. So all of them refuse the same things.
+All arrays of all public functions come in here, so all of them refuse the same things. `read_array`
+leaves JAX's as they are, for what may be traced. `read_host_array` returns NumPy's of a given type,
+`read_numbers` of the type that they have.
 """
 
 from typing import Any

@@ -1,6 +1,9 @@
 """Misuse: its exception, words for its text, and the annotation of arguments checked by hand."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike as ArrayLike
@@ -33,6 +36,16 @@ def shown(value: Any) -> str:
         text = f"{a_or_an(value)} too long to print"
     text = printable(" ".join(text.split()))
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def first_few(items: Sequence[object] | np.ndarray) -> str:
+    """Return the first five, and three dots if there are more."""
+    return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
+
+
+def have(name: str) -> str:
+    """Return ``have`` after the name of many, ``has`` after that of one."""
+    return "have" if name.endswith("s") else "has"
 
 
 def a_or_an(value: Any) -> str:

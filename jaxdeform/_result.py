@@ -37,8 +37,9 @@ class Result(eqx.Enumeration):
         "squared)."
     )
     bad_input = (
-        "Not solved: a target, weight or rest position is not finite, or a rigidity or weight is "
-        "negative. Outside jit, the same call raises and names the entry."
+        "Not solved: a target, weight or rest position is not finite, a rigidity or weight is "
+        "negative, a weight exceeds that of `precompute`, or the rest shape is not the problem's "
+        "own. Outside jit, `deform` raises for the same arguments and names the entry."
     )
     out_of_proportion = (
         "Not to be trusted: the energy is negative, or vertices lie more than ten diagonals from "

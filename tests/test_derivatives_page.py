@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EXACT, FD
+from helpers import EXACT, FD, held_sheet
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -162,3 +162,28 @@ def test_the_whole_example_has_the_gradient_of_its_height():
 
     ends = [exact_height(rigidity + s * 1e-3 * line) for s in (1, -1)]
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-3, rtol=FD)
+
+
+@pytest.mark.slow
+def test_the_law_with_a_volume_has_the_gradient_of_its_deformation(cells):
+    """And it is a minimum: Newton's method stays there."""
+    names = block("corotated", until="mesh =") | block("volume")
+    (code,) = re.findall(r"<!-- law -->\n```python\n(.*?)out = ", PAGE, re.DOTALL)
+    exec(compile(code, "law", "exec"), names)
+    law, price = names["Volume"](), names["price"]
+    found = law.minimize(*cells)
+    np.testing.assert_allclose(newton(price, found, *cells), found, atol=1e-9)
+
+    mesh, handles, targets = held_sheet()
+    problem = jd.precompute(mesh, handles)
+    solver = jd.QuasiNewton(tolerance=1e-15, max_steps=2000)
+
+    def height(log):
+        out = jd.deform(problem, targets, jnp.exp(log), local=law, solver=solver)
+        return jnp.sum(jnp.sin(out.vertices))
+
+    log = np.random.default_rng(8).normal(size=problem.n_vertices)
+    line = np.random.default_rng(9).normal(size=problem.n_vertices)
+    slope = jnp.vdot(jax.grad(height)(log), line)
+    difference = (height(log + 1e-4 * line) - height(log - 1e-4 * line)) / 2e-4
+    np.testing.assert_allclose(slope, difference, rtol=FD)

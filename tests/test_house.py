@@ -29,6 +29,7 @@ PACKAGE = ROOT / "jaxdeform"
 FLOORS = [
     ["_errors"],
     ["_arrays", "_checks", "_result"],
+    ["_values"],
     ["_mesh"],
     ["_linalg"],
     ["_handles"],

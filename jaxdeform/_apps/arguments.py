@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxdeform as jd
-from jaxdeform._checks import check_rigidity
 from jaxdeform._errors import shown
 from jaxdeform._mesh.reading import read_json, read_text
 from jaxdeform._mesh.select import some_where
 from jaxdeform._mesh.selection import check_parts
 from jaxdeform._mesh.words import real
+from jaxdeform._values import read_rigidity
 
 MEDIUM = 0.2
 """A material between rubber and steel, for `rigidity_from_material`."""
@@ -80,7 +80,7 @@ def _number(word: str) -> int | str:
     return int(word) if re.fullmatch(r"[+-]?[0-9]{1,18}", word) else word
 
 
-def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
+def parse_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
     try:
         values = np.asarray(real(text.encode(errors="replace")))
     except ValueError:
@@ -90,7 +90,7 @@ def read_rigidity(text: str, mesh: jd.Mesh) -> np.ndarray:
             ) from None
         values = jd.load_rigidity(text)
     try:
-        check_rigidity(values, mesh.n_vertices, values.dtype)
+        read_rigidity(values, mesh.n_vertices, values.dtype)
     except jd.InputError as error:
         raise jd.InputError(f"--rigidity {text}: {error}") from error
     return values
@@ -129,7 +129,7 @@ class Material(NamedTuple):
 
 def read_material(mesh: jd.Mesh, rigidity: str | None, regions: list[str]) -> Material:
     """Return the rigidity from ``--rigidity`` and from each ``--stiff``, "EXPR: VALUE"."""
-    base = None if rigidity is None else read_rigidity(rigidity, mesh)
+    base = None if rigidity is None else parse_rigidity(rigidity, mesh)
     found = []
     for region in regions:
         expression, _, word = region.rpartition(":")
@@ -141,7 +141,7 @@ def read_material(mesh: jd.Mesh, rigidity: str | None, regions: list[str]) -> Ma
                 '--stiff "y > 0.5" 30'
             ) from None
         try:
-            check_rigidity(value, mesh.n_vertices, value.dtype)
+            read_rigidity(value, mesh.n_vertices, value.dtype)
         except jd.InputError as error:
             raise jd.InputError(f"--stiff: {error}") from error
         found.append((some_where(mesh, expression, "--stiff"), float(value)))

@@ -9,7 +9,7 @@ import time
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from jaxdeform._apps.deforming import DeformCommand, deform
 from jaxdeform._apps.estimating import estimate
 from jaxdeform._apps.mouth import open_closed_outputs
 from jaxdeform._apps.talk import complain, console, mouth, patiently, since
+from jaxdeform._errors import printable
 from jaxdeform._plotting.files import check_picture_path
 
 app = typer.Typer(
@@ -63,6 +64,17 @@ def set_up(
 
 def main() -> None:
     """Run the command line. An InputError becomes a line on standard error and exit code 2."""
+    with warnings.catch_warnings():
+        warnings.showwarning = _complain_of
+        _run()
+
+
+def _complain_of(message: Warning | str, *_: Any) -> None:
+    """Tell of a warning as the command tells of all else, without the line of Python it is from."""
+    complain(f"jaxdeform: {printable(str(message))}")
+
+
+def _run() -> None:
     open_closed_outputs()
     before = signal.signal(signal.SIGINT, _interrupt)
     try:

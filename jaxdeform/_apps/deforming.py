@@ -18,6 +18,7 @@ from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
 from jaxdeform._apps.output import Output
 from jaxdeform._apps.talk import console, counted, patiently, since
 from jaxdeform._checks import check_tolerance
+from jaxdeform._errors import first_few
 
 # Options that a method does not read.
 _RIGIDITY = "--rigidity", "--stiff"
@@ -257,4 +258,4 @@ def _told(path: jd.Solution, frames: int) -> Iterator[str]:
 
 def _numbers(frames: list[int]) -> str:
     """Return the numbers of the first frames, from 1, as their files have them."""
-    return ", ".join(str(k + 1) for k in frames[:5]) + (", ..." if len(frames) > 5 else "")
+    return first_few([k + 1 for k in frames])

@@ -35,6 +35,13 @@ class Motion(NamedTuple):
         x, y, z = self.translate or (0.0, 0.0, 0.0)
         return Motion(rotate, self.about, (share * x, share * y, share * z))
 
+    def turns_in_place(self, points: Float[np.ndarray, "points 3"], size: float) -> bool:
+        """Return whether these points lie on the axis of a rotation without a translation."""
+        if self.rotate is None or self.translate or self.about:
+            return False
+        quarter = self._replace(rotate=(self.rotate[0], 90.0)).of(points)
+        return bool(np.abs(quarter - points).max() <= 1e-12 * size)
+
     def of(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
         """Return where these points move to: rotated, then translated."""
         option = "--rotate"
@@ -105,4 +112,9 @@ def moves_by_place(mesh: jd.Mesh, fix: list[str], move: str | None, motion: Moti
     grabbed = moved.mask[handles]
     targets = mesh.vertices[handles]
     targets[grabbed] = motion.of(targets[grabbed])
+    if motion.turns_in_place(mesh.vertices[handles[grabbed]], mesh.diagonal):
+        raise jd.InputError(
+            f"--rotate: the {int(grabbed.sum())} vertices of --move lie on the axis, which goes "
+            "through their middle, so nothing moves: give --about X Y Z, or choose more vertices"
+        )
     return Moves(handles, mesh.vertices[handles], targets, grabbed, motion)

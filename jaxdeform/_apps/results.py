@@ -1,14 +1,11 @@
 """What the command line writes: meshes and reports."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import jaxdeform as jd
-from jaxdeform._apps.talk import complain
-from jaxdeform._errors import printable
 from jaxdeform._estimation.found_handles import FoundHandles
 from jaxdeform._mesh.files import without_suffix
 
@@ -17,19 +14,15 @@ def save_result(
     out: Path, mesh: jd.Mesh, vertices: np.ndarray | None, rigidity: np.ndarray | None
 ) -> None:
     """Write the result, or beside it, as PLY, what its format cannot hold."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    try:
+        jd.save_mesh(out, mesh, vertices=vertices, rigidity=rigidity)
+    except jd.InputError as error:
+        rescue = without_suffix(out).with_suffix(".rescued.ply")
         try:
-            jd.save_mesh(out, mesh, vertices=vertices, rigidity=rigidity)
-        except jd.InputError as error:
-            rescue = without_suffix(out).with_suffix(".rescued.ply")
-            try:
-                jd.save_mesh(rescue, mesh, vertices=vertices, rigidity=rigidity)
-            except jd.InputError:
-                raise error from None
-            raise jd.InputError(f"{error}; the result is in {rescue}") from error
-    for warning in caught:
-        complain(f"jaxdeform: {printable(str(warning.message))}")
+            jd.save_mesh(rescue, mesh, vertices=vertices, rigidity=rigidity)
+        except jd.InputError:
+            raise error from None
+        raise jd.InputError(f"{error}; the result is in {rescue}") from error
 
 
 def as_json(

@@ -6,9 +6,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
-from jaxdeform._checks import check_type, host_rows_of_three
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._values import read_host_rows
 
 
 def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "vertices controls"]:
@@ -41,7 +42,7 @@ def mean_value_coordinates(vertices: ArrayLike, cage: Mesh) -> Float[Array, "ver
         True
     """
     check_type("cage", cage, Mesh)
-    points = host_rows_of_three("vertices", vertices)
+    points = read_host_rows("vertices", vertices)
     if len(cage.solid_faces) < cage.n_faces:
         raise InputError("the cage has faces without area: drop them with jd.repair(cage)")
     _check_cage(points, cage)

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._arrays import is_concrete
-from jaxdeform._checks import check_flag, check_precision, check_targets, check_type
+from jaxdeform._checks import check_flag, check_precision, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._handles.split import split_handles
 from jaxdeform._linalg.buckets import bucket, cut, enlarge, fill_up
@@ -17,6 +17,7 @@ from jaxdeform._linalg.ell import WIDTHS, EllMatrix
 from jaxdeform._mesh.cells import spokes
 from jaxdeform._mesh.laplacian import normalised_laplacian
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._values import read_positions
 
 
 class _Equations(eqx.Module):
@@ -68,7 +69,9 @@ class LaplacianEditor(eqx.Module):
     def __call__(self, targets: ArrayLike) -> Float[Array, "vertices 3"]:
         """Return the edited positions, differentiable in the targets (handles, 3)."""
         check_precision("this editor", np.dtype(self.rest.dtype))
-        targets = check_targets(targets, len(self.handles), np.dtype(self.rest.dtype))
+        targets = read_positions(
+            "targets", targets, (len(self.handles), 3), np.dtype(self.rest.dtype), "handle"
+        )
         if is_concrete(targets, self.rest, self.handles):
             led = np.array(self.rest)
             led[np.asarray(self.handles)] = targets

@@ -5,7 +5,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdeform._arrays import as_array, is_concrete
-from jaxdeform._checks import check_positions, rows_of_three
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._handles.targets import check_angle
 from jaxdeform._linalg.rotations import (
@@ -14,6 +13,7 @@ from jaxdeform._linalg.rotations import (
     quaternions_from_matrices,
     rotation_matrices,
 )
+from jaxdeform._values import read_jax_positions, read_rows
 
 
 def rigid_transforms(
@@ -40,10 +40,10 @@ def rigid_transforms(
         True
     """
     dtype = jnp.result_type(float)
-    rotations = rows_of_three("rotations", rotations, dtype, unit="control")
+    rotations = read_rows("rotations", rotations, dtype, unit="control")
     shape = rotations.shape
-    translations = check_positions("translations", translations, shape, dtype, unit="control")
-    centers = check_positions("centers", centers, shape, dtype, unit="control")
+    translations = read_jax_positions("translations", translations, shape, dtype, unit="control")
+    centers = read_jax_positions("centers", centers, shape, dtype, unit="control")
     if is_concrete(rotations):
         with np.errstate(over="ignore"):
             angles = np.degrees(np.linalg.norm(rotations, axis=1))
@@ -152,11 +152,11 @@ _ALLOWANCE = 1e-5
 
 def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
     dtype = jnp.result_type(float)
-    vertices = rows_of_three("vertices", vertices, dtype)
+    vertices = read_rows("vertices", vertices, dtype)
     weights = as_array(weights, dtype, "weights")
     if weights.ndim != 2 or len(weights) != len(vertices):
         raise InputError(f"weights have shape {weights.shape}: give ({len(vertices)}, controls)")
-    weights = check_positions("weights", weights, weights.shape, dtype)
+    weights = read_jax_positions("weights", weights, weights.shape, dtype)
     if is_concrete(weights):
         total = np.asarray(weights).sum(axis=1)
         bad = np.flatnonzero(np.abs(total - 1.0) > _ALLOWANCE)
@@ -166,7 +166,7 @@ def _checked_skin(vertices, weights, transforms) -> tuple[Array, Array, Array]:
                 "row by its sum"
             )
     shape = (weights.shape[1], 3, 4)
-    return vertices, weights, check_positions("transforms", transforms, shape, dtype, "control")
+    return vertices, weights, read_jax_positions("transforms", transforms, shape, dtype, "control")
 
 
 def _check_blendable(weights: Array, transforms: Array) -> None:

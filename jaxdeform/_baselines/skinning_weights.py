@@ -7,16 +7,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdeform._arrays import as_array, is_concrete
-from jaxdeform._checks import (
-    check_labels,
-    check_positions,
-    check_type,
-    rows_of_three,
-)
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._handles.split import check_components
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import check_handles
+from jaxdeform._values import read_jax_positions, read_labels, read_rows
 
 
 def rigid_weights(
@@ -120,7 +116,7 @@ def bounded_biharmonic_weights(
     index = check_handles(handles, mesh)
     count = len(index)
     given = np.arange(count) if group is None else group
-    group = check_labels("group", given, count, "handle", count)
+    group = read_labels("group", given, count, "handle", count)
     count = int(group.max()) + 1
     empty = np.setdiff1d(np.arange(count), group)
     if empty.size:
@@ -151,14 +147,14 @@ def bounded_biharmonic_weights(
 def _squares(vertices, controls, distances) -> Float[Array, "vertices controls"]:
     """Return squared distances to points or segments, or the squares of given distances."""
     dtype = jnp.result_type(float)
-    vertices = rows_of_three("vertices", vertices, dtype)
+    vertices = read_rows("vertices", vertices, dtype)
     ends = as_array(controls, dtype, "controls")
     if ends.ndim not in (2, 3) or ends.shape[1:] not in ((3,), (2, 3)) or not len(ends):
         raise InputError(
             f"controls have shape {ends.shape}: give points (controls, 3) or bones "
             "(controls, 2, 3), at least one"
         )
-    ends = check_positions("controls", ends, ends.shape, dtype, unit="control")
+    ends = read_jax_positions("controls", ends, ends.shape, dtype, unit="control")
     n, m = len(vertices), len(ends)
     if distances is not None:
         return _given_squares(as_array(distances, dtype, "distances"), (n, m))

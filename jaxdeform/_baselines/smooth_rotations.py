@@ -246,7 +246,7 @@ def _hessian(energy: SmoothEnergy, targets, p, t):
     point = ~(_turning_stiffness(energy, p, t) > 0)
 
     def multiply(x):
-        return hessian(x) + jnp.stack([system.held(x[0]), jnp.where(point[None], x[1], 0.0)])
+        return hessian(x) + jnp.stack([system.at_fixed(x[0]), jnp.where(point[None], x[1], 0.0)])
 
     return multiply
 
@@ -257,7 +257,7 @@ def _preconditioner(energy: SmoothEnergy, p, t):
 
     def precondition(x):
         turn = x[1] / jnp.where(size > 0, size, 1.0)[None]
-        return jnp.stack([system.factor.solve(x[0]) + system.held(x[0]), turn])
+        return jnp.stack([system.factor.solve(x[0]) + system.at_fixed(x[0]), turn])
 
     return precondition
 

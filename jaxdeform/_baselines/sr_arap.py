@@ -12,7 +12,7 @@ from jaxdeform._baselines.smooth_rotations import (
     with_derivative_of_minimum,
 )
 from jaxdeform._checks import check_count, check_flag, check_tolerance, check_type
-from jaxdeform._deformation.arguments import from_center, read_inputs, read_shape
+from jaxdeform._deformation.arguments import from_center, read_inputs, read_vertices
 from jaxdeform._deformation.problem import precompute
 from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import (
@@ -98,7 +98,7 @@ def sr_arap(
     relative = from_center(problem, "targets", targets, (len(problem.handles), 3), "handle")
     inputs = read_inputs(problem, relative, 0.0, None)
     if start is not None:
-        start = read_shape(problem, "start", start)
+        start = read_vertices(problem, "start", start)
     else:
         start = guess_at_once(problem.system, inputs.targets)
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)

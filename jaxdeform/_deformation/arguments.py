@@ -7,24 +7,24 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdeform._arrays import as_array, is_concrete
-from jaxdeform._checks import (
-    check_flag,
-    check_one_per_handle,
-    check_rigidity,
-    read_host_positions,
-    read_positions,
-)
+from jaxdeform._checks import check_flag
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.local_step_check import check_local_step
-from jaxdeform._deformation.problem import Problem
+from jaxdeform._deformation.problem import Problem, fits_cells
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.buckets import fill_up
+from jaxdeform._values import (
+    read_host_positions,
+    read_one_per_handle,
+    read_positions,
+    read_rigidity,
+)
 
 
-class Settings(NamedTuple):
+class DeformSettings(NamedTuple):
     """What does not depend on values, and is compiled into the program."""
 
     energy: ReducedEnergy
@@ -32,7 +32,9 @@ class Settings(NamedTuple):
     adjoint: Adjoint
 
 
-def read_settings(local: Any, solver: Any, adjoint: Any, normals: Any) -> Settings:
+def read_settings(
+    dtype: np.dtype, local: Any, solver: Any, adjoint: Any, normals: Any
+) -> DeformSettings:
     """Return the settings of a deformation, or raise InputError: they exclude each other."""
     check_flag("normals", normals)
     if solver is None:
@@ -43,8 +45,8 @@ def read_settings(local: Any, solver: Any, adjoint: Any, normals: Any) -> Settin
             "with normals the iteration is not the descent of one energy (n' lags behind): use "
             "solver=Alternating() and adjoint=Unrolled()"
         )
-    check_local_step(local)
-    return Settings(ReducedEnergy(local, normals), solver, adjoint)
+    check_local_step(local, dtype)
+    return DeformSettings(ReducedEnergy(local, normals), solver, adjoint)
 
 
 def read_inputs(
@@ -54,22 +56,29 @@ def read_inputs(
     handle_weights: ArrayLike | None,
 ) -> Inputs:
     """Check the rigidity and the weights, and spread everything over all vertices."""
-    rigidity = read_rigidity(problem, rigidity)
+    rigidity = spread_rigidity(problem, rigidity)
     spread = spread_targets(problem, targets)
     soft = read_weights(problem, handle_weights)
     # NumPy's arrays are JAX's once they are inside.
     return Inputs(cast(Array, spread), cast(Array, rigidity), soft)
 
 
-def read_rigidity(
+def spread_rigidity(
     problem: Problem, rigidity: ArrayLike
 ) -> Float[Array, "vertices"] | Float[np.ndarray, "vertices"]:
-    """Check the rigidity, and spread it over the arrays of the system."""
+    """Check the rigidity, and spread it over the arrays of the system.
+
+    It is NaN, which ends in ``bad_input``, if JAX traces the problem and its arrays turn out to be
+    of another mesh. (Known ones are refused by `check_problem`.)
+    """
     size = problem.bucket
-    return fill_up(check_rigidity(rigidity, problem.n_vertices, problem.dtype, size=size), size)
+    out = fill_up(read_rigidity(rigidity, problem.n_vertices, problem.dtype, size=size), size)
+    if is_concrete(problem):
+        return out
+    return jnp.where(fits_cells(problem), out, jnp.asarray(jnp.nan, problem.dtype))
 
 
-def read_shape(
+def read_vertices(
     problem: Problem, name: str, vertices: ArrayLike
 ) -> Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"]:
     """Read positions of all vertices relative to the centre of the rest shape, and fill them up."""
@@ -121,7 +130,7 @@ def read_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "v
     if weights is None:
         return system.soft
     given = as_array(weights, problem.dtype, "handle_weights")
-    given = jnp.broadcast_to(check_one_per_handle(given, handles.shape), handles.shape)
+    given = jnp.broadcast_to(read_one_per_handle(given, handles.shape), handles.shape)
     given = jnp.where(system.free[handles], given, 0.0)
     if is_concrete(given, system.soft):
         most = np.asarray(system.soft)[np.asarray(handles)]

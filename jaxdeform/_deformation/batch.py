@@ -12,17 +12,17 @@ from jaxtyping import Float
 
 from jaxdeform._arrays import is_concrete, read_numbers
 from jaxdeform._checks import check_count, check_flag, check_function
-from jaxdeform._deformation.arguments import Settings, read_settings, read_weights
+from jaxdeform._deformation.arguments import DeformSettings, read_settings, read_weights
 from jaxdeform._deformation.descent import Solver
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import Solution, cut_to_mesh, solve
 from jaxdeform._deformation.system import System
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, have
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.lbfgs import SLOTS
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import check_result
 
@@ -148,11 +148,11 @@ def _planned(
     """Check all arguments; return the number of members, and the chunks, none begun."""
     check_problem(problem)
     check_count("memory of the chunks, in bytes,", memory, most=2**62)
-    how = read_settings(local, solver, None, normals)
+    settings = read_settings(problem.dtype, local, solver, None, normals)
     soft = read_weights(problem, handle_weights)
     batch = _Batch.read(problem, targets, rigidity, start)
     length = _size_of_chunk(problem, batch.size, memory)
-    return batch.size, _chunks(problem, batch, soft, how, length)
+    return batch.size, _chunks(problem, batch, soft, settings, length)
 
 
 class _Batch(NamedTuple):
@@ -189,7 +189,8 @@ class _Batch(NamedTuple):
             if array.shape[1:] != wanted[name] or not len(array):
                 last = ", ".join(map(str, wanted[name]))
                 raise InputError(
-                    f"{name} have shape {array.shape}: give (batch, {last}), at least one member"
+                    f"{name} {have(name)} shape {array.shape}: give (batch, {last}), at least "
+                    "one member"
                 )
             sizes[name] = len(array)
         most = "targets" if sizes["targets"] > 1 else max(sizes, key=lambda name: sizes[name])
@@ -198,8 +199,8 @@ class _Batch(NamedTuple):
             if own not in (1, size):
                 hint = f", or (1, {n}) for one field" if name == "rigidity" else ""
                 raise InputError(
-                    f"{name} are for {own} members, but {most} for {size}: give as many, or one "
-                    f"for all{hint}"
+                    f"{name} {have(name)} {own} members, but {most} {have(most)} {size}: give as "
+                    f"many, or one for all{hint}"
                 )
         return _Batch(size, given["targets"], given["rigidity"], given.get("start"))
 
@@ -222,7 +223,7 @@ def _size_of_chunk(problem: Problem, size: int, memory: int) -> int:
 
 
 def _chunks(
-    problem: Problem, batch: _Batch, soft: Any, how: Settings, length: int
+    problem: Problem, batch: _Batch, soft: Any, settings: DeformSettings, length: int
 ) -> Iterator[tuple[slice, Solution]]:
     devices = jax.make_mesh((jax.device_count(),), ("batch",), axis_types=(AxisType.Auto,))
     system, soft = _everywhere(devices, PartitionSpec(), (problem.system, soft))
@@ -230,7 +231,7 @@ def _chunks(
     for first in range(0, batch.size, length):
         own = _read_chunk(problem, batch, slice(first, first + length))
         own = _everywhere(devices, PartitionSpec("batch"), own)
-        waiting.append((first, _solve_chunk(system, soft, own, how, devices)))
+        waiting.append((first, _solve_chunk(system, soft, own, settings, devices)))
         if len(waiting) == _IN_FLIGHT:
             yield _finished(waiting.pop(0), batch.size, problem.n_vertices)
     for chunk in waiting:
@@ -267,14 +268,18 @@ def _everywhere(devices: jax.sharding.Mesh, spec: PartitionSpec, arrays: Any) ->
     return jax.tree.map(put, arrays)
 
 
-@quick_jit(static=("how", "devices"), options=AS_FAST)
+@quick_jit(static=("settings", "devices"), options=AS_FAST)
 def _solve_chunk(
-    system: System, soft: Any, own: tuple[Any, ...], how: Settings, devices: jax.sharding.Mesh
+    system: System,
+    soft: Any,
+    own: tuple[Any, ...],
+    settings: DeformSettings,
+    devices: jax.sharding.Mesh,
 ) -> Solution:
     def some(system, soft, own):
         def one(own):
             targets, rigidity, start = own
-            return solve(system, Inputs(targets, rigidity, soft), start, how)
+            return solve(system, Inputs(targets, rigidity, soft), start, settings)
 
         return jax.vmap(one)(own)
 
@@ -293,4 +298,4 @@ def _finished(chunk: tuple[int, Solution], size: int, count: int) -> tuple[slice
         out = jax.tree.map(partial(multihost_utils.process_allgather, tiled=True), out)
     last = min(first + len(out.steps), size)
     out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), out)
-    return slice(first, last), settled(cut_to_mesh(out, count))
+    return slice(first, last), wait_for(cut_to_mesh(out, count))

@@ -26,7 +26,7 @@ from jaxdeform._checks import check_count
 from jaxdeform._deformation.arguments import from_center, read_inputs
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_blocks, stiffness
 from jaxdeform._deformation.local_step import LocalStep, Newton
-from jaxdeform._deformation.metric import compliance
+from jaxdeform._deformation.metric_factor import compliance
 from jaxdeform._deformation.problem import Problem, check_problem, precompute
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs
@@ -229,7 +229,7 @@ def _thinner(problem: Problem, alpha: float) -> Problem:
             factorise(matrix, free, dtype, positions=fill_up(rest.T, size).T),
         ),
     )
-    return Problem(system, problem.handles, cells)
+    return Problem(system.sealed(problem.handles), problem.handles, cells)
 
 
 @jax.jit

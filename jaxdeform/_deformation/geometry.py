@@ -35,6 +35,8 @@ class Graph(eqx.Module):
     faces: Int[Array, "3 faces"]
     opposite: Int[Array, "3 faces"]
     """The edge opposite to each corner."""
+    weights: Float[Array, "edges"]
+    """The problem's own edge weights."""
     follows: Bool[Array, "edges"]
     """True where the weight is the cotangent weight, and so a function of the rest shape."""
 
@@ -84,6 +86,7 @@ def _graph_of(cells: Cells, dtype: np.dtype) -> Graph:
         overlap=jnp.asarray(cells.overlap, dtype),
         faces=index(mesh.solid_faces.T),
         opposite=index(opposite_edges(mesh)),
+        weights=jnp.asarray(cells.weights, dtype),
         follows=jnp.asarray(cells.weights == cotangent_weights(mesh)),
     )
 

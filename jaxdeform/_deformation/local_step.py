@@ -48,8 +48,9 @@ class LocalStep(Protocol):
     """What ``deform(..., local=)`` takes: how the transformation of each cell is found.
 
     All arrays have the cells on their last axis and are in the cell's principal axes, where B is
-    diagonal. A local step is a setting: it must be hashable (a frozen dataclass is). See
-    docs/derivatives.md for a complete example of one's own.
+    diagonal. So a cell at rest has a rotation for T, not I, and a law must be isotropic: a function
+    of the principal stretches. A local step is a setting: it must be hashable (a frozen dataclass
+    is). See docs/derivatives.md for a complete example of one's own.
     """
 
     def minimize(self, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:

@@ -2,9 +2,11 @@
 
 import inspect
 from functools import cache
+from typing import cast
 
 import jax
-import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from jaxdeform._checks import check_setting
 from jaxdeform._deformation.local_step import (
@@ -15,7 +17,7 @@ from jaxdeform._deformation.local_step import (
     Newton,
     RotationFit,
 )
-from jaxdeform._errors import InputError
+from jaxdeform._errors import InputError, a_or_an
 
 _OURS = (Newton, LBFGS, GradientDescent, RotationFit, AffineFit)
 _METHODS = {
@@ -25,7 +27,7 @@ _METHODS = {
 }
 
 
-def check_local_step(local: object) -> None:
+def check_local_step(local: object, dtype: np.dtype) -> None:
     """Raise InputError unless this is a local step that can be called."""
     if type(local) in _OURS:
         return
@@ -37,7 +39,7 @@ def check_local_step(local: object) -> None:
         "a local step, such as jd.Newton(), or jd.RotationFit() for ARAP, or one of your own (see "
         "jd.LocalStep)",
     )
-    for method, names in _METHODS.items():
+    for method, names in _methods(local).items():
         try:
             inspect.signature(getattr(local, method)).bind(*names)
         except TypeError as error:
@@ -45,19 +47,30 @@ def check_local_step(local: object) -> None:
                 f"{name}.{method} cannot be called with ({', '.join(names)}): {error}; see "
                 "jd.LocalStep"
             ) from error
-    if not isinstance(local, _OURS):
-        _check_what_it_returns(local, jnp.result_type(float))
+    _check_what_it_returns(cast(LocalStep, local), dtype)
+
+
+def _methods(local: object) -> dict[str, tuple[str, ...]]:
+    """Return the arguments of each method; the one that may be missing, if it is there."""
+    optional = {"strain_rigidity": ("rigidity",)} if hasattr(local, "strain_rigidity") else {}
+    return _METHODS | optional
 
 
 @cache
-def _check_what_it_returns(local: LocalStep, dtype) -> None:
+def _check_what_it_returns(local: LocalStep, dtype: np.dtype) -> None:
     c, b, rigidity = (jax.ShapeDtypeStruct((*axes, 5), dtype) for axes in ((3, 3), (3,), ()))
     known = {"c": c, "t": c, "b": b, "rigidity": rigidity}
-    for method, names in _METHODS.items():
-        out = jax.eval_shape(getattr(local, method), *(known[name] for name in names))
-        wanted = (5,) if method == "energy" else c.shape
-        if getattr(out, "shape", None) != wanted or getattr(out, "dtype", None) != dtype:
-            raise InputError(
-                f"{type(local).__name__}.{method} returned {out} for 5 cells of {dtype}: return "
-                f"one array of shape {wanted} and that type, the cells on the last axis"
-            )
+    for method, names in _methods(local).items():
+        wanted = c.shape if method in ("minimize", "with_implicit_derivative") else (5,)
+
+        def call(*given, method=method, wanted=wanted):
+            out = getattr(local, method)(*given)
+            kind = f"{out.dtype}{list(out.shape)}" if isinstance(out, Array) else a_or_an(out)
+            if kind != f"{dtype}{list(wanted)}":
+                raise InputError(
+                    f"{type(local).__name__}.{method} returned {kind} for 5 cells of {dtype}: "
+                    f"return one array of shape {wanted} and that type, the cells on the last axis"
+                )
+            return out
+
+        jax.eval_shape(call, *(known[name] for name in names))

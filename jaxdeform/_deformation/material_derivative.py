@@ -63,8 +63,8 @@ class _Hessian(NamedTuple):
     """Half the Hessian of phi in every cell, and its factor.
 
     As a linear solve of its own, so that derivatives of second order solve again instead of
-    differentiating the elimination. H is factored outside of it: what solves for many right sides,
-    as conjugate gradients do, factors once.
+    differentiating the elimination. H is factored outside of it: what solves for many right-hand
+    sides, as conjugate gradients do, factors once.
     """
 
     of: tuple[Grid, list[Array], Array]

@@ -10,7 +10,7 @@ from jaxdeform._deformation.arguments import (
     from_center,
     read_inputs,
     read_settings,
-    read_shape,
+    read_vertices,
 )
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.metric import apply_metric, metric_of
@@ -57,10 +57,10 @@ def is_minimum(
         True
     """
     check_problem(problem)
-    energy = read_settings(local, None, None, False).energy
+    energy = read_settings(problem.dtype, local, None, None, False).energy
     moved = from_center(problem, "targets", targets, (len(problem.handles), 3), "handle")
     inputs = read_inputs(problem, moved, rigidity, handle_weights)
-    shape = read_shape(problem, "vertices", vertices)
+    shape = read_vertices(problem, "vertices", vertices)
     return _look(problem.system, inputs, jnp.asarray(shape), energy)
 
 

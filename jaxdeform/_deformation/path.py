@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 from jaxdeform._arrays import is_concrete, read_array, read_numbers
 from jaxdeform._checks import check_flag, check_function
 from jaxdeform._deformation.arguments import (
-    Settings,
+    DeformSettings,
     from_center,
     read_inputs,
     read_settings,
-    read_shape,
+    read_vertices,
 )
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.local_step import LocalStep, Newton
@@ -24,7 +24,7 @@ from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import Solution, cut_to_mesh, descend, guess, without_derivative
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, check_result
 
@@ -54,8 +54,8 @@ def deform_path(
     compiles anew. With ``Implicit()`` the derivatives of a frame are those of its own targets, not
     of the frames before: a minimum does not depend on where it was found from.
 
-    A frame that is not finite or out of proportion is not started from. The next one starts from
-    the last frame before it that is sound, and its own result says how that went.
+    A frame whose result is ``not_finite``, ``out_of_proportion`` or ``bad_input`` is not started
+    from. The next one starts from the last frame before it that has none of these.
 
     **Arguments**
 
@@ -90,21 +90,21 @@ def deform_path(
     check_problem(problem)
     check_flag("throw", throw)
     check_function("progress", progress, "frames done, frames")
-    how = read_settings(local, solver, adjoint, normals)
+    settings = read_settings(problem.dtype, local, solver, adjoint, normals)
     relative = _from_center(problem, targets)
     inputs = read_inputs(problem, relative, rigidity, handle_weights)
     system = problem.system
-    shape = system.rest if start is None else read_shape(problem, "start", start)
+    shape = system.rest if start is None else read_vertices(problem, "start", start)
     last = _Last.of(shape)
     if progress is None:
-        _, out = _follow(system, inputs, last, how)
+        _, out = _follow(system, inputs, last, settings)
     else:
         if not is_concrete(system, inputs, last):
             raise InputError(
                 "progress is told while the frames are computed, not while JAX traces (jit, vmap, "
                 "grad): leave it out there"
             )
-        out = _follow_slowly(system, inputs, last, how, progress)
+        out = _follow_slowly(system, inputs, last, settings, progress)
     out = cut_to_mesh(out, problem.n_vertices)
     return check_result(out, throw)
 
@@ -170,33 +170,39 @@ class _Last(NamedTuple):
         return jax.tree.map(lambda x, old: jnp.where(sound, x, old), new, self)
 
 
-_SOUND = Result.converged, Result.steps_done, Result.step_limit
+_UNSOUND = Result.not_finite, Result.out_of_proportion, Result.bad_input
 
 
-@quick_jit(static=("how",), options=AS_FAST)
-def _follow(system: System, inputs: Inputs, last: _Last, how: Settings) -> tuple[_Last, Solution]:
+@quick_jit(static=("settings",), options=AS_FAST)
+def _follow(
+    system: System, inputs: Inputs, last: _Last, settings: DeformSettings
+) -> tuple[_Last, Solution]:
     """Run all frames of ``inputs.targets`` (frames, 3, vertices), and return where they end."""
     system = without_derivative(system)
-    led = (~system.free | (system.soft > 0))[None]
+    led = system.led[None]
 
     def frame(last: _Last, targets: Float[Array, "3 vertices"]):
         first = last.start_of_next(system, jnp.where(led, targets, last.targets))
-        out, p = descend(system, inputs._replace(targets=targets), first, how)
-        sound = jnp.any(jnp.stack([out.result == member for member in _SOUND]))
+        out, p = descend(system, inputs._replace(targets=targets), first, settings)
+        sound = ~jnp.any(jnp.stack([out.result == member for member in _UNSOUND]))
         return last.then(p, jnp.where(led, targets, last.targets), sound), out
 
     return jax.lax.scan(frame, last, inputs.targets)
 
 
 def _follow_slowly(
-    system: System, inputs: Inputs, last: _Last, how: Settings, progress: Callable[[int, int], Any]
+    system: System,
+    inputs: Inputs,
+    last: _Last,
+    settings: DeformSettings,
+    progress: Callable[[int, int], Any],
 ) -> Solution:
     """Run the frames one by one, and tell of each."""
     frames = inputs.targets.shape[0]
     done = []
     for k in range(frames):
         one = inputs._replace(targets=inputs.targets[k : k + 1])
-        last, out = settled(_follow(system, one, last, how))
+        last, out = wait_for(_follow(system, one, last, settings))
         done.append(out)
         progress(k + 1, frames)
     return jax.tree.map(lambda *x: jnp.concatenate(x), *done)

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._arrays import is_concrete
-from jaxdeform._checks import check_precision, check_rigidity, check_type
+from jaxdeform._checks import check_precision, check_type
 from jaxdeform._deformation.covariance import stiffness
-from jaxdeform._deformation.system import System, build_system, fingerprint
-from jaxdeform._errors import ArrayLike, InputError, shown
+from jaxdeform._deformation.system import System, build_system, fingerprint, seal_of
+from jaxdeform._errors import ArrayLike, InputError, a_or_an, first_few, shown
 from jaxdeform._handles.split import HandleSplit, split_handles
 from jaxdeform._linalg.buckets import bucket, cut, enlarge, fill_up
 from jaxdeform._linalg.cholesky import Factor, NotPositiveDefinite, factorise
@@ -23,6 +23,7 @@ from jaxdeform._mesh.bounded import bounded_cells
 from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.laplacian import lifted_weights
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._values import read_rigidity
 
 # Further from the origin, in diagonals, float32 keeps fewer than four digits of a position.
 _FAR_IN_FLOAT32 = 1e3
@@ -84,6 +85,8 @@ class Problem(eqx.Module):
 
     def __repr__(self) -> str:
         """Return the sizes, not the arrays."""
+        if any(not hasattr(x, "shape") for x in (self.system.rest, self.handles)):
+            return "Problem(without its arrays)"
         if self.system.rest.ndim > 2:
             return f"Problem({len(self.handles)} stacked, {self.bucket} vertices, {self.dtype})"
         return f"Problem({self.n_vertices} vertices, {len(self.handles)} handles, {self.dtype})"
@@ -153,8 +156,9 @@ def precompute(
             f"{_LARGEST_IN_FLOAT32:g} and below {1 / _LARGEST_IN_FLOAT32:g} leave the range of "
             "float32; give it in another unit of length, or use float64"
         )
-    used, matrix, factor = _factorise(cells, rest, split, dtype)
-    return Problem(build_system(used, rest, split, matrix, factor, dtype), split.index, used)
+    with jax.ensure_compile_time_eval():  # known numbers also inside jit
+        used, matrix, factor = _factorise(cells, rest, split, dtype)
+        return Problem(build_system(used, rest, split, matrix, factor, dtype), split.index, used)
 
 
 def _checked_dtype(dtype: Any) -> np.dtype:
@@ -180,11 +184,10 @@ def _factorise(
     positions = fill_up(rest.T, size).T
     used, bad = bounded_cells(cells)
     if bad.size:
-        shown = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
         warnings.warn(
             f"negative weights (obtuse angles) leave the energy of {len(bad)} cells without a "
-            f"lower bound (cells {shown}): {int((used.weights != cells.weights).sum())} edge "
-            "weights count as 0 there. Pass weights of your own, none negative, to decide "
+            f"lower bound (cells {first_few(bad)}): {int((used.weights != cells.weights).sum())} "
+            "edge weights count as 0 there. Pass weights of your own, none negative, to decide "
             "otherwise.",
             stacklevel=3,
         )
@@ -221,18 +224,49 @@ def _factorise(
 def check_problem(problem: Any) -> None:
     """Raise InputError unless this is a problem, of one mesh, that JAX can compute with now."""
     check_type("problem", problem, Problem)
+    _check_arrays(problem)
     check_precision("problem", problem.dtype)
     if problem.system.rest.ndim > 2:
         raise InputError(
             "problem: a stack of problems, which jax.vmap takes apart: call "
             "jax.vmap(lambda problem, targets: jd.deform(problem, targets, ...))(stack, targets)"
         )
-    own, cells = problem.system.fingerprint, problem.cells
-    if cells is not None and is_concrete(own) and not np.array_equal(own, fingerprint(cells)):
+    known, system, cells = is_concrete(problem), problem.system, problem.cells
+    if known and cells and not np.array_equal(system.fingerprint, fingerprint(cells)):
         raise InputError(
             "problem: its arrays are of another mesh, or of other cells, than its cells: read a "
             "file of arrays into what precompute makes of the same mesh, handles and cells"
         )
+    if known and not np.array_equal(system.seal, seal_of(system, problem.handles)):
+        raise InputError(
+            "problem: its arrays or handles are not those that precompute made together: they "
+            "were changed, rounded, or come from two problems. Call precompute again"
+        )
+
+
+def _check_arrays(problem: Problem) -> None:
+    """Raise InputError unless all arrays are there."""
+    needed = vars(problem.system) | {"handles": problem.handles}
+    if needed["sides"] is None:
+        del needed["sides"]
+    for leaf in jax.tree.leaves(needed, is_leaf=lambda x: x is None):
+        if not isinstance(leaf, Array | np.ndarray):
+            raise InputError(
+                f"problem: holds {a_or_an(leaf)} where an array belongs: put its parts together "
+                "first, as by equinox.combine"
+            )
+        if isinstance(leaf, Array) and is_concrete(leaf) and leaf.is_deleted():
+            raise InputError(
+                "problem: its arrays are deleted, as jit does with arguments that it may donate "
+                "(donate_argnums): keep a copy, or call precompute again"
+            )
+
+
+def fits_cells(problem: Problem) -> Bool[Array, ""] | bool:
+    """Return whether traced arrays are of the cells of the problem; a stack has none."""
+    if problem.cells is None:
+        return True
+    return jnp.all(problem.system.fingerprint == fingerprint(problem.cells))
 
 
 def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array, "vertices"]:
@@ -255,7 +289,7 @@ def rigidity_from_material(problem: Problem, constant: ArrayLike) -> Float[Array
     """
     check_problem(problem)
     size = problem.bucket
-    constant = check_rigidity(
+    constant = read_rigidity(
         constant, problem.n_vertices, problem.dtype, name="constant", size=size
     )
     constant = jnp.asarray(fill_up(constant, size))

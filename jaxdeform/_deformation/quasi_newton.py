@@ -1,4 +1,4 @@
-"""The default solver: L-BFGS on the reduced energy, preconditioned with the factor of A."""
+"""The default solver: L-BFGS on the reduced energy, with a metric that knows the rigidity."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +15,7 @@ from jaxdeform._deformation.metric import Choice, apply_metric, metric_of
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.saddles import leave_saddles, lowest_curvature
 from jaxdeform._deformation.system import System
-from jaxdeform._linalg.lbfgs import Function, Settings, minimize
+from jaxdeform._linalg.lbfgs import Function, LbfgsSettings, minimize
 from jaxdeform._result import Result
 
 
@@ -33,8 +33,8 @@ class QuasiNewton:
 
     **Fields**
 
-    - tolerance: stop once a plain step is expected to lower the energy by less than this fraction
-      of it.
+    - tolerance: stop once a step of the metric alone should lower the energy by less than this
+      fraction of it.
     - max_steps: most iterations.
     - history_length: number of past steps that shape the next one.
     - metric: ``"stiffness"``: A^-1, the same for every rigidity. ``"material"``: a factor made for
@@ -83,15 +83,15 @@ class QuasiNewton:
     ) -> Descent:
         """Iterate until converged; under vmap the batch is a queue (linalg/lbfgs.py)."""
         metric = metric_of(system, energy.local, inputs.rigidity, self.metric)
-        settings = Settings(self.tolerance, self.max_steps, self.history_length)
+        settings = LbfgsSettings(self.tolerance, self.max_steps, self.history_length)
 
         def evaluate(system, own, p):
             return energy.evaluate_batch(system, own[0], p)
 
-        def apply(system, own, gradient, plain):
+        def apply(system, own, gradient, safe):
             if own[1] is None:
                 return system.factor.solve(gradient)
-            return jax.vmap(apply_metric, in_axes=(None, 0, 0, 0))(system, own[1], gradient, plain)
+            return jax.vmap(apply_metric, in_axes=(None, 0, 0, 0))(system, own[1], gradient, safe)
 
         function = Function(evaluate, apply)
         descend = lambda start: minimize(function, system, (inputs, metric), start, settings)  # noqa: E731

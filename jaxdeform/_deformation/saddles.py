@@ -25,7 +25,7 @@ from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
 from jaxdeform._linalg.batching import is_shared, one_by_one, spread_over_members
 from jaxdeform._linalg.lanczos import lowest_mode
-from jaxdeform._linalg.lbfgs import Minimum, Settings
+from jaxdeform._linalg.lbfgs import LbfgsSettings, Minimum
 
 # Steps of Lanczos where the sign does not show before.
 MOST = 64
@@ -89,7 +89,7 @@ def leave_saddles(
     curvature: Callable[[Array, Array, Array], tuple[Array, Array]],
     start: Float[Array, "3 vertices"],
     size: Float[Array, ""],
-    settings: Settings,
+    settings: LbfgsSettings,
 ) -> tuple[Minimum, Bool[Array, ""]]:
     """Descend; from a saddle go on along its direction of negative curvature.
 

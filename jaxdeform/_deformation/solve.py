@@ -11,28 +11,29 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._arrays import is_concrete
-from jaxdeform._checks import check_flag, check_rigidity, read_positions
+from jaxdeform._checks import check_flag
 from jaxdeform._deformation.arguments import (
-    Settings,
+    DeformSettings,
     from_center,
     read_inputs,
     read_settings,
-    read_shape,
+    read_vertices,
 )
 from jaxdeform._deformation.cell_energy import cell_energies
 from jaxdeform._deformation.descent import Adjoint, Anchor, Descent, Solver
 from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
+from jaxdeform._deformation.outcome import inside_out, outcome_of
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
-from jaxdeform._deformation.verdict import inside_out, verdict
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, first_few
 from jaxdeform._linalg.buckets import cut, fill_up
 from jaxdeform._linalg.known_value import with_derivative_of
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, check_result, succeeded
+from jaxdeform._values import read_positions, read_rigidity
 
 
 class Solution(eqx.Module):
@@ -76,12 +77,12 @@ class Solution(eqx.Module):
         t = np.asarray(self.transforms)
         finite = np.isfinite(t).all(axis=(1, 2))
         orientation = np.einsum("ki,ki->k", t[:, 0], np.cross(t[:, 1], t[:, 2]))
-        flipped = finite & (orientation <= 0)
+        # Of a deformation that was not done the cells say nothing.
+        flipped = finite & (orientation <= 0) & (self.result != Result.bad_input)
         text = Result[self.result]
         for what, bad in (("at fault", ~finite), ("inside out (det T <= 0)", flipped)):
             at = np.flatnonzero(bad)
-            shown = ", ".join(map(str, at[:5])) + (", ..." if len(at) > 5 else "")
-            text += f" Cells {what}: {shown} ({len(at)} of {len(t)})." if at.size else ""
+            text += f" Cells {what}: {first_few(at)} ({len(at)} of {len(t)})." if at.size else ""
         return text
 
 
@@ -153,28 +154,28 @@ def deform(
     """
     check_problem(problem)
     check_flag("throw", throw)
-    how = read_settings(local, solver, adjoint, normals)
+    settings = read_settings(problem.dtype, local, solver, adjoint, normals)
     rows = len(problem.handles)
     relative = from_center(problem, "targets", targets, (rows, 3), "handle")
     inputs = read_inputs(problem, relative, rigidity, handle_weights)
     if start is not None:
-        start = read_shape(problem, "start", start)
+        start = read_vertices(problem, "start", start)
     if rest is not None or edge_weights is not None:
         inputs = inputs._replace(geometry=read_geometry(problem, rest, edge_weights))
-        if not how.adjoint.needs_one_energy:
+        if not settings.adjoint.needs_one_energy:
             raise InputError(
                 "rest and edge_weights are differentiated by Implicit() only: give "
                 "adjoint=jd.Implicit()"
             )
     if start is None:
         start = guess_at_once(problem.system, inputs.targets)
-    out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, how), problem.n_vertices)
+    out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, settings), problem.n_vertices)
     return check_result(out, throw)
 
 
 def cut_to_mesh(out: Solution, count: int) -> Solution:
     """Leave out what fills up the arrays of a solution, and wait for it where Ctrl-C is heard."""
-    out = settled(out)
+    out = wait_for(out)
     vertices, transforms = cut(out.vertices, count, -2), cut(out.transforms, count, -3)
     return dataclasses.replace(out, vertices=vertices, transforms=transforms)
 
@@ -197,13 +198,13 @@ def energy(
     """
     check_problem(problem)
     system = problem.system
-    p = jnp.asarray(read_shape(problem, "vertices", vertices))
+    p = jnp.asarray(read_vertices(problem, "vertices", vertices))
     shape = problem.n_vertices, 3, 3
     t = read_positions("transforms", transforms, shape, problem.dtype)
     t = np.asarray(t) if is_concrete(t) else t
     t = fill_up(t.transpose(1, 2, 0), problem.bucket)
     # Without rigidity, so that T = 0 of what fills up costs nothing.
-    lam = fill_up(check_rigidity(rigidity, problem.n_vertices, problem.dtype), problem.bucket)
+    lam = fill_up(read_rigidity(rigidity, problem.n_vertices, problem.dtype), problem.bucket)
     return _energy(system, p, jnp.asarray(t), jnp.asarray(lam))
 
 
@@ -224,16 +225,16 @@ def solve(
     system: System,
     inputs: Inputs,
     start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"] | None,
-    how: Settings,
+    settings: DeformSettings,
 ) -> Solution:
     """Deform once; without a start, from Laplacian editing."""
     system = without_derivative(system)
     if start is None:
         start = first_guess(system, inputs.targets)
-    return descend(system, inputs, jnp.asarray(start), how)[0]
+    return descend(system, inputs, jnp.asarray(start), settings)[0]
 
 
-_solve_at_once = quick_jit(static=("how",), options=AS_FAST)(solve)
+_solve_at_once = quick_jit(static=("settings",), options=AS_FAST)(solve)
 
 
 def first_guess(system: System, targets: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
@@ -254,18 +255,17 @@ def guess(system: System, displacement: Float[Array, "3 vertices"]) -> Float[Arr
 
     Soft handles lead like hard ones.
     """
-    led = ~system.free | (system.soft > 0)
-    return system.initial_guess(jnp.where(led[None], displacement, 0.0))
+    return system.initial_guess(jnp.where(system.led[None], displacement, 0.0))
 
 
 def descend(
-    system: System, inputs: Inputs, start: Float[Array, "3 vertices"], how: Settings
+    system: System, inputs: Inputs, start: Float[Array, "3 vertices"], settings: DeformSettings
 ) -> tuple[Solution, Float[Array, "3 vertices"]]:
     """Minimise from a start, whose hard handles need not be on their targets.
 
     Return the solution, and its positions relative to the centre of the rest shape.
     """
-    energy, solver, adjoint = how
+    energy, solver, adjoint = settings
     start = jnp.where(system.free[None], start, inputs.targets)
     end, anchor = adjoint.solve(solver, energy, system, inputs, start)
     p = end.positions
@@ -285,7 +285,7 @@ def solution_of(system: System, inputs: Inputs, end: Descent, value: Float[Array
         ),
         energy=jnp.where(after, value, end.energy),
         steps=end.steps,
-        result=verdict(*jax.lax.stop_gradient((system, inputs, end))),
+        result=outcome_of(*jax.lax.stop_gradient((system, inputs, end))),
         flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
     )
 

@@ -1,5 +1,7 @@
 """All that the iterations read, as arrays whose shapes meshes of about one size share."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,12 +11,13 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxdeform._deformation.covariance import CovarianceMap, covariance_blocks
 from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
+from jaxdeform._errors import ArrayLike
 from jaxdeform._handles.split import HandleSplit
 from jaxdeform._linalg.buckets import bucket, fill_up, next_of
 from jaxdeform._linalg.cholesky import Factor
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.cells import Cells, principal_moments
-from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._mesh.mesh import Mesh, content_digest
 from jaxdeform._mesh.normals import corner_sides
 from jaxdeform._mesh.polygons import from_triangles
 
@@ -45,11 +48,22 @@ class System(eqx.Module):
     initial_guess: LaplacianGuess
     fingerprint: UInt32[Array, "2"]
     """Of the cells and their mesh, which stand beside these arrays and may come from elsewhere."""
+    seal: UInt32[Array, "2"]
+    """Of the handles and of these arrays, as far as they are small: see `seal_of`."""
     faces: Int[Array, "faces 3"]
     sides: Float[Array, "faces 3"] | None
     """-1 where a face is turned over as seen from a corner; None stands for 1 everywhere."""
 
-    def held(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
+    def sealed(self, handles: ArrayLike) -> "System":
+        """Return the system with the seal of its arrays and these handles."""
+        return dataclasses.replace(self, seal=jax.device_put(seal_of(self, handles)))
+
+    @property
+    def led(self) -> Bool[Array, "vertices"]:
+        """True where the first guess is given: at fixed vertices and soft handles."""
+        return ~self.free | (self.soft > 0)
+
+    def at_fixed(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
         """Return x at the vertices that are not free, 0 elsewhere.
 
         Added to a Hessian, which is 0 there, it makes the system regular.
@@ -72,8 +86,8 @@ def build_system(
     all_axes = np.tile(np.eye(3)[..., None], size)
     all_axes[..., : len(axes)] = axes.transpose(1, 2, 0)
     faces, sides = _filled_up_faces(mesh, size)
-    led = fill_up(split.free & (split.soft == 0), size)
-    return System(
+    unled = fill_up(split.free & (split.soft == 0), size)
+    system = System(
         rest=put(fill_up(rest.T, size)),
         center=put(mesh.center),
         free=jax.device_put(fill_up(split.free, size)),
@@ -83,16 +97,30 @@ def build_system(
         covariance=CovarianceMap.of(covariance_blocks(cells, rest, axes, size), dtype),
         stiffness=EllMatrix.build([[matrix]], dtype),
         factor=factor,
-        initial_guess=laplacian_guess(cells, led, dtype),
+        initial_guess=laplacian_guess(cells, unled, dtype),
         fingerprint=jax.device_put(fingerprint(cells)),
+        seal=jnp.zeros(2, jnp.uint32),
         faces=jax.device_put(faces),
         sides=None if sides is None else put(sides),
     )
+    return system.sealed(split.index)
 
 
 def fingerprint(cells: Cells) -> UInt32[np.ndarray, "2"]:
     """Return what tells these cells from others, of this mesh or another."""
     return np.frombuffer(cells.digest[:8], np.uint32)
+
+
+def seal_of(system: System, handles: ArrayLike) -> UInt32[np.ndarray, "2"]:
+    """Return what tells arrays and handles that were made together from others.
+
+    Of what is read here: the place of every vertex, whether it is free, and which factor it is. (To
+    read the matrices too would take as long as an iteration.)
+    """
+    own = system.rest, system.center, system.free, system.soft, system.principal_moments
+    key = getattr(system.factor, "key", system.center)
+    digest = content_digest(np.asarray(handles, np.int64), *map(np.asarray, (*own, key)))
+    return np.frombuffer(digest[:8], np.uint32)
 
 
 def _filled_up_faces(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdeform._deformation.adjoint import Implicit
-from jaxdeform._deformation.arguments import Settings, spread_targets
+from jaxdeform._deformation.arguments import DeformSettings, spread_targets
 from jaxdeform._deformation.descent import Adjoint, Solver
 from jaxdeform._deformation.local_step import Newton
 from jaxdeform._deformation.problem import Problem
@@ -17,7 +17,7 @@ from jaxdeform._deformation.solve import deform, solve
 from jaxdeform._deformation.system import System
 from jaxdeform._estimation.poses import Poses
 from jaxdeform._linalg.buckets import fill_up
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import quick_jit
 
 
@@ -54,7 +54,7 @@ def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoi
         start = observed if isinstance(adjoint, Implicit) else None
         out = deform(problem, targets, field, solver=solver, adjoint=adjoint, start=start)
         found.append(State(out.vertices, out.transforms))
-    return settled(found)
+    return wait_for(found)
 
 
 class Known(NamedTuple):
@@ -88,7 +88,7 @@ def pose(system: System, known: Known, field, solver, adjoint) -> Float[Array, "
     inputs = Inputs(jnp.asarray(known.targets), field, system.soft)
     if isinstance(adjoint, Implicit):
         return adjoint.minimum(energy, system, inputs, known.positions, known.transforms)[0]
-    out = solve(system, inputs, None, Settings(energy, solver, adjoint))
+    out = solve(system, inputs, None, DeformSettings(energy, solver, adjoint))
     return out.vertices.T - system.center[:, None]
 
 
@@ -100,7 +100,7 @@ def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDeri
     theta = np.asarray(theta, problem.dtype)
     ends = states(problem, poses, np.exp(theta)[label], solver, adjoint)
     everywhere = fill_up(label, problem.bucket)
-    each = settled(
+    each = wait_for(
         [
             _derivatives(
                 problem.system,

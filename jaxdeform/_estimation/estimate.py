@@ -36,7 +36,7 @@ class Estimate:
     - solver_error: root mean square distance of the solver's end from the minimum (a length). The
       intervals allow for as much in the observed poses; a smaller misfit says nothing.
     - outliers: (poses, vertices) True where a vertex was left out, because it was seen far from
-      where its neighbors say.
+      where its neighbours say.
     - history: (evaluations,) misfit of each evaluation, accepted or not.
     - result: how the search ended, a member of `Result`.
     """
@@ -76,8 +76,8 @@ class Estimate:
         )
         if self.misfit <= self.solver_error:
             lines.append(
-                f"the misfit is below the error of the solver ({self.solver_error:.2g}): the poses "
-                "are explained as well as its tolerance allows"
+                f"the misfit is within the error of the solver ({self.solver_error:.3g}): the "
+                "poses are explained as well as its tolerance allows"
             )
         if self.outliers.any():
             at = np.argwhere(self.outliers)
@@ -94,5 +94,8 @@ class Estimate:
         hidden = self.displacement[k] < _VISIBLE * self.diagonal
         kinds = [kind for kind, unseen in zip(("softer", "stiffer"), hidden, strict=True) if unseen]
         if kinds:
-            text += f"; {' or '.join(kinds)} makes no visible difference"
+            text += (
+                f"; {' or '.join(kinds)} makes no visible difference (less than "
+                f"{100 * _VISIBLE:g} % of the diagonal at any vertex)"
+            )
         return text

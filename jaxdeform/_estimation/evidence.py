@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxdeform._estimation.field_prior import Prior
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 
 # Patterns that are looked for. Of the bar, bent once, with noise of 1e-4, 10 to 20 are above it.
 _PATTERNS = 48
@@ -40,7 +40,7 @@ class Patterns(NamedTuple):
 
 def find_patterns(run: Any, prior: Prior) -> Patterns:
     """Return the patterns at an evaluation: its point, residual and Jacobian."""
-    vectors, effects = map(np.asarray, settled(_probe(run.jacobian, prior)))
+    vectors, effects = map(np.asarray, wait_for(_probe(run.jacobian, prior)))
     # Of the generalised eigenproblem in the space that was found.
     metric = vectors.T @ np.asarray(prior.product(jnp.asarray(vectors)))
     root = np.linalg.cholesky(metric)

@@ -33,7 +33,7 @@ class FieldEstimate:
     - field: (vertices,) the rigidity of each vertex; its unit is length squared.
     - interval: (vertices, 2) 95 % interval of each, under the smooth prior.
     - determined: (vertices,) True where the interval is within a factor of ten to both sides. Where
-      it is not, the poses say next to nothing, and the value is that of the neighbors.
+      it is not, the poses say next to nothing, and the value is that of the neighbours.
     - smoothness: weight of the prior, as given or as chosen.
     - noise: standard deviation of a coordinate that the poses have under this prior (a length).
     - vertices: (poses, vertices, 3) the fitted poses.
@@ -79,7 +79,7 @@ def estimate_rigidity_field(
     Minimises ``sum |deform(rigidity) - observed|^2 / diagonal^2 + smoothness * t^T L t`` over the
     logarithm t of the rigidity, where L is the cotangent Laplacian: ``t^T L t`` is the integral of
     |grad t|^2 over the surface, a pure number that does not change with scale or resolution. That
-    is the smooth prior. Total variation instead counts differences of neighbors by their size, not
+    is the smooth prior. Total variation instead counts differences of neighbours by their size, not
     by their square (those below 1 % do as before): the field comes in pieces with borders between
     them (Rudin, Osher and Fatemi, "Nonlinear total variation based noise removal algorithms", 1992,
     doi:10.1016/0167-2789(92)90242-F). It is minimised by reweighted squares, from the smooth field.
@@ -94,7 +94,7 @@ def estimate_rigidity_field(
     - smoothness: weight of the prior. By default, the one under which the poses are most
       probable (marginal likelihood): ``(noise / (diagonal * slope))^2``, with the standard
       deviation of the noise of a coordinate and of the difference of log rigidity between
-      neighbors. More smooths. That of total variation is the largest under which the misfit still
+      neighbours. More smooths. That of total variation is the largest under which the misfit still
       is that of the noise (Morozov's discrepancy principle).
     - prior: ``"smooth"``, or ``"total_variation"`` for parts of one material each. The second takes
       twice the time.

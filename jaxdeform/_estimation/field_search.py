@@ -22,7 +22,7 @@ from jaxdeform._estimation.field_prior import FLAT, Prior, Solve, WithPrior
 from jaxdeform._estimation.poses import Poses, same_length
 from jaxdeform._estimation.search import search
 from jaxdeform._linalg.buckets import fill_up
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._result import Result, succeeded
 
 # The prior is strong at first and weakens by this factor a stage.
@@ -145,7 +145,7 @@ class FieldSearch:
         each = [as_known(problem, *x) for x in zip(self.poses.targets, ends, strict=True)]
         known = jax.tree.map(lambda *x: np.stack(x), *each)
         point = jnp.asarray(theta, problem.dtype)
-        run = settled(_linearise(problem.system, self.seen, known, point, *settings))
+        run = wait_for(_linearise(problem.system, self.seen, known, point, *settings))
         self.history.append(self.misfit(run))
         if self.progress is not None:
             self.progress(len(self.history), self.history[-1], field)

@@ -64,7 +64,7 @@ def find_handle_groups(
 
     The thesis takes the vertices where the best linear map of the 1-ring (Eq. 4.6) is the identity,
     which misses handles that were rotated. Here a vertex whose whole 1-ring moved rigidly seeds a
-    group. The group grows over neighbors that follow its motion, and the motion is fitted again,
+    group. The group grows over neighbours that follow its motion, and the motion is fitted again,
     until neither changes. Several poses are taken together: a group moves rigidly in each.
 
     Vertices that merely happen not to deform are found too; leave them out of the handles if you
@@ -126,7 +126,7 @@ def _groups_within(search: RigidGroups, tolerance: float) -> tuple[RigidGroup, .
     groups = search.within(tolerance)
     if not groups:
         raise InputError(
-            "no handles found: nowhere did a vertex and its neighbors move rigidly within "
+            "no handles found: nowhere did a vertex and its neighbours move rigidly within "
             f"{tolerance * search.mesh.diagonal:.3g} ({tolerance:.3g} of the diagonal); raise the "
             "tolerance to about four times the noise, or name the handles yourself. Where nothing "
             "is rigid, as in a face, take each fifteenth vertex or so, with precompute(..., "

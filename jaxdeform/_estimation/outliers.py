@@ -1,4 +1,4 @@
-"""Vertices that were seen in a wrong place: far from what their neighbors say."""
+"""Vertices that were seen in a wrong place: far from what their neighbours say."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 _FAR = 6.0
 # More than this fraction of the vertices are no outliers: then the model is wrong, or the noise.
 _MANY = 0.1
-# As many neighbors are asked, and at least so many must have been seen.
+# As many neighbours are asked, and at least so many must have been seen.
 _ASKED, _FEWEST = 12, 3
 
 
@@ -17,17 +17,17 @@ def find_outliers(
     counted: Bool[np.ndarray, "poses vertices"],
     floor: float,
 ) -> Bool[np.ndarray, "poses vertices"]:
-    """Return the vertices whose residual lies far from the median of their neighbors' residuals.
+    """Return the vertices whose residual lies far from the median of their neighbours' residuals.
 
-    Smooth errors of the model move neighbors alike and are kept. Deviations under ``floor`` (a
+    Smooth errors of the model move neighbours alike and are kept. Deviations under ``floor`` (a
     length) are none.
     """
-    neighbors = _neighbors(edges, counted.shape[1])
+    neighbours = _neighbours(edges, counted.shape[1])
     found = np.zeros(counted.shape, bool)
     for pose, mask in enumerate(counted):
         asked = np.append(residual[pose], [[np.nan] * 3], axis=0)
         asked[:-1][~mask] = np.nan
-        around = asked[neighbors]
+        around = asked[neighbours]
         enough = mask & (np.isfinite(around[..., 0]).sum(axis=1) >= _FEWEST)
         if not enough.any():
             continue
@@ -37,8 +37,8 @@ def find_outliers(
     return found if found.sum() <= _MANY * counted.sum() else np.zeros_like(found)
 
 
-def _neighbors(edges, n: int) -> Int[np.ndarray, "vertices asked"]:
-    """Return some neighbors of each vertex; n stands for none."""
+def _neighbours(edges, n: int) -> Int[np.ndarray, "vertices asked"]:
+    """Return some neighbours of each vertex; n stands for none."""
     both = np.concatenate([edges, edges[:, ::-1]])
     both = both[np.argsort(both[:, 0], kind="stable")]
     place = np.arange(len(both)) - np.searchsorted(both[:, 0], both[:, 0])

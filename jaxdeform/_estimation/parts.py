@@ -12,12 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxdeform._checks import (
-    check_count,
-    check_flag,
-    check_function,
-    check_tolerance,
-)
+from jaxdeform._checks import check_count, check_flag, check_function, check_tolerance
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton

@@ -7,12 +7,12 @@ from jaxtyping import Bool, Float
 
 from jaxdeform._arrays import read_host_array
 from jaxdeform._baselines.laplacian_editing import laplacian_editing
-from jaxdeform._checks import check_rigidity, read_positions
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._errors import InputError
 from jaxdeform._estimation.resemblance import check_resemblance
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import read_mask_or_numbers
+from jaxdeform._values import read_positions, read_rigidity
 
 # Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.
@@ -153,7 +153,7 @@ def check_start(start: Any, default: np.ndarray, unit: str) -> Float[np.ndarray,
         return default
     given = read_host_array(start, np.float64, "start")
     count = len(default)
-    values = np.asarray(check_rigidity(given, count, given.dtype, name="start", unit=unit))
+    values = np.asarray(read_rigidity(given, count, given.dtype, name="start", unit=unit))
     if (values <= 0).any():
         raise InputError("start must be above 0, because the search runs on its logarithm")
     return values

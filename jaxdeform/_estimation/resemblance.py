@@ -68,7 +68,7 @@ def _check_orientation(problem: Problem, pose: int, positions, mask) -> None:
     if mirrored > 0.6 * curved.sum():
         raise InputError(
             f"observed pose {pose} is a mirror image of the rest shape ({mirrored} of "
-            f"{curved.sum()} curved neighborhoods are): flip one of its coordinates"
+            f"{curved.sum()} curved neighbourhoods are): flip one of its coordinates"
         )
 
 

@@ -52,7 +52,7 @@ class RigidGroups:
         """Return the noise (a fraction of the diagonal) of the rings that moved most rigidly.
 
         It is the RMS of a coordinate about a ring's own rigid motion, of the fifth ring from below,
-        or on large meshes of one in 200: with six neighbors, one pose and noise alone about 0.55
+        or on large meshes of one in 200: with six neighbours, one pose and noise alone about 0.55
         times its standard deviation.
         """
         errors = np.sort(self._rings.mean[np.isfinite(self._rings.mean)])
@@ -62,8 +62,8 @@ class RigidGroups:
     def within(self, tolerance: float) -> tuple[RigidGroup, ...]:
         """Return the groups that moved rigidly within a fraction of the diagonal, largest first.
 
-        A vertex whose whole 1-ring moved rigidly seeds a group. The group grows over neighbors that
-        follow its motion, and the motion is fitted again, until neither changes.
+        A vertex whose whole 1-ring moved rigidly seeds a group. The group grows over neighbours
+        that follow its motion, and the motion is fitted again, until neither changes.
         """
         errors, reach = self._rings.largest, tolerance * self.mesh.diagonal
         waiting = errors <= reach
@@ -110,7 +110,7 @@ def _rotations(covariance: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, ".
 
 
 class _RingErrors(NamedTuple):
-    """How far each 1-ring is from moving rigidly; infinite for fewer than two neighbors."""
+    """How far each 1-ring is from moving rigidly; infinite for fewer than two neighbours."""
 
     largest: Float[np.ndarray, "vertices"]
     """Distance of the vertex that is farthest off, over the poses."""
@@ -142,7 +142,7 @@ def _ring_errors(p, poses, graph: sp.csr_matrix) -> _RingErrors:
 
 def _grow(p, poses, graph, seed: int | np.integer, reach: float, allowed) -> RigidGroup | None:
     """Grow a group from the 1-ring of its seed; None if the group loses that ring."""
-    ring = np.append(_neighbors(graph, np.array([seed])), seed)
+    ring = np.append(_neighbours(graph, np.array([seed])), seed)
     members = ring
     for _ in range(_GROWTHS):
         motion = _best_motion(p[members], poses[:, members])
@@ -169,7 +169,7 @@ def _followers(
         seen[front] = True
         follow = allowed[front] & (motion.distances(p[front], poses[:, front]) <= reach)
         found.append(front[follow])
-        around = np.unique(_neighbors(graph, found[-1]))
+        around = np.unique(_neighbours(graph, found[-1]))
         front = around[~seen[around]]
     followers = np.sort(np.concatenate(found))
     if len(found[0]) == len(members):  # connected, as the members were
@@ -181,7 +181,9 @@ def _followers(
     return followers[label == label[at]]
 
 
-def _neighbors(graph: sp.csr_matrix, rows: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "neighbors"]:
+def _neighbours(
+    graph: sp.csr_matrix, rows: Int[np.ndarray, "rows"]
+) -> Int[np.ndarray, "neighbours"]:
     """Return the columns of the rows, one row after the other (a sixth of the time of scipy's)."""
     first = graph.indptr[rows]
     count = graph.indptr[rows + 1] - first

@@ -15,7 +15,7 @@ import optimistix as optx
 import scipy
 
 from jaxdeform._estimation.bounded_gauss_newton import BoundedGaussNewton, Evaluation, recorded
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._result import Result
 
 # Bounds of intervals are good to this much of log rigidity.
@@ -69,7 +69,7 @@ def search(
     point = first.evaluation.point
     state = _begin(solver, first.evaluation)
     for more in range(max_evaluations, -1, -1):
-        point, state, done, why = settled(_advance(solver, point, tried.evaluation, state))
+        point, state, done, why = wait_for(_advance(solver, point, tried.evaluation, state))
         if state.num_steps_since_acceptance == 0:
             best = tried
         if why == optx.RESULTS.nonfinite:

@@ -33,8 +33,6 @@ _MOST = 64
 _DIVISIONS = 256
 # Weights are kept within these multiples of the typical one.
 _LEAST, _LARGEST = 1e-6, 1e6
-# Half-width of the 95 % interval of the normal distribution, in standard deviations.
-_NORMAL_95 = 1.959964
 
 
 def segment_rigidity(
@@ -45,7 +43,7 @@ def segment_rigidity(
     Minimises ``sum_i w_i (log field_i - c_part(i))^2 + cost * length of the borders`` over the
     parts and their values c. The weight w_i is the area of vertex i over the square of its
     interval's width, relative to the median: vertices of which the poses say nothing follow their
-    neighbors. The cost is two mean edges times the square of the smallest difference between two
+    neighbours. The cost is two mean edges times the square of the smallest difference between two
     c, so that spots narrower than a few edges belong to what is around them.
 
     A part may have several components: both soft ends of a bar with a stiff band are one part. How
@@ -226,7 +224,7 @@ class _Borders(NamedTuple):
         return changed if self.total(changed) < self.total(parts) else parts
 
     def without_seams(self, parts):
-        """Return the parts after components were given to their neighbors, where that is cheaper.
+        """Return the parts after components were given to their neighbours, where that is cheaper.
 
         Between a soft and a stiff part, a blurred field passes through all that lies between. No
         exchange of two parts removes such a seam, half of which belongs to either side.

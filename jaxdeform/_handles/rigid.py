@@ -5,10 +5,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxdeform._arrays import float_type, is_concrete
-from jaxdeform._checks import check_labels, check_positions, rows_of_three
 from jaxdeform._errors import ArrayLike
 from jaxdeform._handles.targets import check_angle, run_motion
 from jaxdeform._linalg.rotations import rotation_matrices
+from jaxdeform._values import read_jax_positions, read_labels, read_rows
 
 
 def rigid_targets(
@@ -47,15 +47,15 @@ def rigid_targets(
     """
     # The points give the type, unless they are integers: rotations must not be rounded to those.
     dtype = float_type(points)
-    points = rows_of_three("points", points, dtype, unit="handle")
-    rotations = rows_of_three("rotations", rotations, dtype, unit="group")
+    points = read_rows("points", points, dtype, unit="handle")
+    rotations = read_rows("rotations", rotations, dtype, unit="group")
     if is_concrete(rotations):
         _check_angles(np.asarray(rotations, np.float64))
     shape = rotations.shape
-    translations = check_positions("translations", translations, shape, dtype, unit="group")
-    group = check_labels("group", group, len(points), "handle", len(rotations))
+    translations = read_jax_positions("translations", translations, shape, dtype, unit="group")
+    group = read_labels("group", group, len(points), "handle", len(rotations))
     if centers is not None:
-        centers = check_positions("centers", centers, shape, dtype, unit="group")
+        centers = read_jax_positions("centers", centers, shape, dtype, unit="group")
     return jnp.asarray(run_motion(_moved, points, group, rotations, translations, centers))
 
 

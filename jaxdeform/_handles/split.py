@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxdeform._checks import check_handle_weights
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import check_handles
+from jaxdeform._values import read_handle_weights
 
 
 def check_components(mesh: Mesh, anchored: Int[np.ndarray, "anchored"]) -> None:
@@ -38,7 +38,7 @@ class HandleSplit(NamedTuple):
 def split_handles(mesh: Mesh, handles: ArrayLike, handle_weights: ArrayLike) -> HandleSplit:
     """Split the vertices into hard handles, soft handles and free vertices, or raise InputError."""
     index = check_handles(handles, mesh)
-    weights = check_handle_weights(handle_weights, index)
+    weights = read_handle_weights(handle_weights, index)
     check_components(mesh, index[weights > 0])
     is_soft = np.isfinite(weights)
     free, soft = mesh.referenced.copy(), np.zeros(mesh.n_vertices)

@@ -16,9 +16,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxdeform._arrays import float_type, read_array, read_host_array, read_numbers
-from jaxdeform._checks import read_axis
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._linalg.rotations import rotation_matrices
+from jaxdeform._values import read_axis
 
 Points = Float[np.ndarray, "points 3"] | Float[Array, "points 3"]
 

@@ -13,7 +13,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from jaxdeform._arrays import is_concrete
-from jaxdeform._linalg.waiting import settled
+from jaxdeform._linalg.waiting import wait_for
+from jaxdeform._linalg.xla import has_accelerator
 
 # Four sizes a doubling: 10 % more vertices on average, 25 % at most.
 _STEPS = 4
@@ -66,8 +67,8 @@ def cut(x: jax.Array, count: int, axis: int = -1) -> jax.Array:
     if x.shape[axis] == count:
         return x
     at = (*(slice(None),) * (axis % x.ndim), slice(count))
-    if is_concrete(x) and jax.default_backend() == "cpu":
-        return jax.device_put(np.asarray(settled(x))[at])
+    if is_concrete(x) and not has_accelerator():
+        return jax.device_put(np.asarray(wait_for(x))[at])
     return x[at]
 
 

@@ -9,6 +9,8 @@ products (nested_dissection.py) or, for small meshes, the inverse.
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,6 +23,7 @@ from jaxdeform._linalg.factor_cache import SHIFTS, Matrix, NotPositiveDefinite, 
 from jaxdeform._linalg.ffi import installed_interface
 from jaxdeform._linalg.host_call import HostFunction
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
+from jaxdeform._linalg.xla import has_accelerator
 
 # Up to this many vertices the inverse is kept as a dense matrix where calls to the host are slow:
 # where there is an accelerator, or no FFI (ffi.py).
@@ -125,11 +128,6 @@ def dense_inverse(
     return DenseInverse(jax.device_put((0.5 * (inverse + inverse.T)).astype(dtype)))
 
 
-def has_accelerator() -> bool:
-    """Whether calls back to the host would cost more than the products that avoid them."""
-    return jax.default_backend() != "cpu"
-
-
 # ---------------------------------------------------------------- on the host
 
 
@@ -149,12 +147,22 @@ def _solve_on_host(out: np.ndarray, *operands: np.ndarray) -> None:
         shared = tuple(
             slice(None) if size == 1 else i for i, size in zip(member, batch, strict=True)
         )
-        right = np.broadcast_to(columns, out.shape)[shared]
-        packed = np.moveaxis(right, -2, 0)
-        solution = np.empty(packed.shape, out.dtype)
-        flat = len(solution), -1
-        _solve_columns(solution.reshape(flat), one, packed.reshape(flat))
-        out[shared] = np.moveaxis(solution, 0, -2)
+        out[shared] = solve_together(
+            _solve_columns, one, np.broadcast_to(columns, out.shape)[shared]
+        )
+
+
+def solve_together(
+    solve: Callable[[np.ndarray, list[Any], np.ndarray], None],
+    matrix: list[Any],
+    columns: Float[np.ndarray, "*members n k"],
+) -> Float[np.ndarray, "*members n k"]:
+    """Return the solution of one matrix for all members, whose columns are solved side by side."""
+    packed = np.moveaxis(columns, -2, 0)
+    solution = np.empty(packed.shape, columns.dtype)
+    flat = len(solution), -1
+    solve(solution.reshape(flat), matrix, packed.reshape(flat))
+    return np.moveaxis(solution, 0, -2)
 
 
 def _solve_columns(out: np.ndarray, matrix: list[np.ndarray], columns: np.ndarray) -> None:

@@ -193,7 +193,7 @@ def multiply(
 
     def residual(z):
         u, v = split(z)
-        return join(u, v - _product_at_once(matrix, u))
+        return join(u, v - _product_in_few_operations(matrix, u))
 
     def solve(_, right):
         u, v = split(right)
@@ -223,7 +223,7 @@ def _fold_into_batch(size: int, batched, matrix: EllMatrix, x):
     return jnp.moveaxis(y.reshape(*y.shape[:-1], x.shape[-2], size), -1, 0), True
 
 
-def _product_at_once(matrix: EllMatrix, x: Float[Array, "*lead in vertices batch"]):
+def _product_in_few_operations(matrix: EllMatrix, x: Float[Array, "*lead in vertices batch"]):
     """Return ``matrix @ x`` in few operations, traced at every call but run by derivatives only."""
 
     def product(columns, values, x):

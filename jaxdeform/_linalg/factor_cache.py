@@ -197,12 +197,12 @@ class FactorCache:
 
         def make() -> HostFactor:
             if not np.array_equal(matrix.key(), key):
-                raise _mixed_up()
+                raise mixed_up()
             return HostFactor.of(matrix, dtype, shifts)
 
         factor = self.find(key, dtype, make)
         if not factor.matrix.equals(matrix):
-            raise _mixed_up()
+            raise mixed_up()
         return factor
 
     def find(
@@ -281,7 +281,8 @@ class FactorCache:
             total -= self._entries.pop(name).size
 
 
-def _mixed_up() -> ValueError:
+def mixed_up() -> ValueError:
+    """Return the error for a key and a matrix that do not belong together."""
     return ValueError(
         "the arrays of this factor do not belong together: some were changed or come from another "
         "problem. Make the problem anew with precompute"

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdeform._linalg.ffi import C_FUNCTION, Interface
+from jaxdeform._linalg.xla import has_accelerator
 
 _used, _exiting = threading.Event(), threading.Event()
 _running: list[str] = []
@@ -58,7 +59,7 @@ class HostFunction:
 
     def __call__(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
         """Return the result of a call, traced or not."""
-        if self.native and jax.default_backend() == "cpu":
+        if self.native and not has_accelerator():
             _used.set()
             return jax.ffi.ffi_call(self._name, result, vmap_method="expand_dims")(*operands)
         rank = operands[0].ndim

@@ -20,8 +20,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._linalg.batching import is_shared, one_by_one, spread_over_members
-from jaxdeform._linalg.cholesky import has_accelerator
-from jaxdeform._linalg.xla import after_reads, without_fusion
+from jaxdeform._linalg.xla import after_reads, has_accelerator, without_fusion
 
 # How many members of the batch iterate together. More slots wait longer for each other at the end
 # and outgrow the caches; fewer leave cores idle. Each of 64 bars takes 10.5, 10.3, 11.2, 13.7 and
@@ -35,7 +34,7 @@ SLOTS = 12
 VERTICES_AT_ONCE = 1 << 22
 
 
-class Settings(NamedTuple):
+class LbfgsSettings(NamedTuple):
     """When to stop, and how many steps to remember; see `QuasiNewton`."""
 
     tolerance: float
@@ -60,9 +59,9 @@ class Function(NamedTuple):
     evaluate: Callable[[Any, Any, Array], Sample]
     """Of (system, inputs, p); the members are the last axis of inputs, p and the result."""
     metric: Callable[[Any, Any, Array, Array], Array]
-    """Of (system, inputs, gradient, plain); the members are the first axis of all but the system.
+    """Of (system, inputs, gradient, safe); the members are the first axis of all but the system.
 
-    Returns H^-1 gradient, H an approximation of the Hessian. Where ``plain``, H is so large that
+    Returns H^-1 gradient, H an approximation of the Hessian. Where ``safe``, H is so large that
     the step cannot raise the function."""
 
 
@@ -77,7 +76,7 @@ class Minimum(NamedTuple):
     converged: Bool[Array, ""]
 
     @staticmethod
-    def unknown(start: Float[Array, "*batch 3 vertices"], settings: Settings) -> "Minimum":
+    def unknown(start: Float[Array, "*batch 3 vertices"], settings: LbfgsSettings) -> "Minimum":
         """Return zeros of these shapes, for a start or for a batch of them."""
         *lead, _, n = start.shape
         zeros = lambda *shape: jnp.zeros((*lead, *shape), start.dtype)  # noqa: E731
@@ -91,9 +90,9 @@ class Minimum(NamedTuple):
 
 
 def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."]:
-    """Return whether a plain step would gain less than the tolerance, or less than rounding hides.
+    """Return whether the step -H^-1 g would gain less than the tolerance, or than rounding hides.
 
-    The gain <g, A^-1 g> is a square, so it is known far more exactly than the energy itself.
+    The gain <g, H^-1 g> is a square, so it is known far more exactly than the energy itself.
     """
     eps = jnp.finfo(energy.dtype).eps
     return gain <= tolerance * jnp.abs(energy) + 1e3 * eps * rounding
@@ -104,7 +103,7 @@ def minimize(
     system: Any,
     inputs: Any,
     start: Float[Array, "3 vertices"],
-    settings: Settings,
+    settings: LbfgsSettings,
 ) -> Minimum:
     """Minimise from a start. Under vmap over ``inputs`` and ``start``, run the batch as a queue."""
 
@@ -127,7 +126,7 @@ def minimize(
 
 
 class _Memory(NamedTuple):
-    """The last steps s of each slot, and z = A^-1 y, where y is the change of the gradient.
+    """The last steps s of each slot, and z = H^-1 y, where y is the change of the gradient.
 
     The large arrays are ring buffers. The inner products that the two-loop recursion needs are kept
     in order of age, oldest first, so that a direction costs two passes over each large array.
@@ -158,7 +157,7 @@ class _Slots(NamedTuple):
     z: Float[Array, "slots 3 vertices"]
     """H^-1 gradient."""
     back: Float[Array, "slots 3 vertices"]
-    """Minus the step without memory: z, or where the last step was refused, that of ``plain``."""
+    """Minus the step without memory: z, or where the last step was refused, the safe one."""
     gain: Float[Array, "slots"]
     """<gradient, z>: twice the expected gain of the step -z."""
     iteration: Int[Array, "slots"]
@@ -181,7 +180,7 @@ class _Queue(NamedTuple):
     out: Minimum
 
 
-def _run_queue(function, system, inputs, start, settings: Settings) -> Minimum:
+def _run_queue(function, system, inputs, start, settings: LbfgsSettings) -> Minimum:
     count = start.shape[0]
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
     slots = min(count, most)
@@ -216,7 +215,7 @@ def _run_queue(function, system, inputs, start, settings: Settings) -> Minimum:
     return jax.lax.while_loop(lambda q: jnp.any(q.member < count), finish_some, begin).out
 
 
-def _empty(p: Float[Array, "slots 3 vertices"], settings: Settings) -> _Slots:
+def _empty(p: Float[Array, "slots 3 vertices"], settings: LbfgsSettings) -> _Slots:
     w, m, dtype = p.shape[0], settings.history_length, p.dtype
     zeros = lambda *shape: jnp.zeros((w, *shape), dtype)  # noqa: E731
     shape, small = p.shape[1:], (m, m)
@@ -247,16 +246,16 @@ def _restart(
     )
 
 
-def _converged(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
+def _converged(work: _Slots, settings: LbfgsSettings) -> Bool[Array, "slots"]:
     return has_converged(work.gain, work.at.energy, work.at.rounding, settings.tolerance)
 
 
-def _done(work: _Slots, settings: Settings) -> Bool[Array, "slots"]:
+def _done(work: _Slots, settings: LbfgsSettings) -> Bool[Array, "slots"]:
     running = (work.iteration <= settings.max_steps) & ~work.stalled & ~_converged(work, settings)
     return (work.iteration > 0) & ~(running & jnp.isfinite(work.at.energy))
 
 
-def _advance(function: Function, system, inputs, settings: Settings, tick, work: _Slots):
+def _advance(function: Function, system, inputs, settings: LbfgsSettings, tick, work: _Slots):
     step = _direction(work.memory, work.back, tick)
     # The first iteration evaluates the start: its step is zero and its old energy infinite. (The
     # local step is thus compiled only once.) A member that is done waits.
@@ -265,21 +264,21 @@ def _advance(function: Function, system, inputs, settings: Settings, tick, work:
     last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (inputs, p))
     new = without_fusion(tick >= 0, work.at, partial(function.evaluate, system), *last)
     first = work.iteration == 0
-    # Where even a step of ``plain`` ends in NaN there is no way on: it is kept, which ends the
+    # Where even the safe step ends in NaN there is no way on: it is kept, which ends the
     # member.
     lost = work.refused & jnp.isnan(new.energy)
     good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731
     right = jnp.moveaxis(jnp.stack([new.gradient - work.at.gradient, new.gradient]), -1, 0)
     g = right[:, 1]
-    # After a refused step the way on is a step of ``plain`` from the old place.
+    # After a refused step the way on is the safe step from the old place.
     back = jnp.where(good[:, None, None], g, jnp.moveaxis(work.at.gradient, -1, 0))
     back = function.metric(system, inputs, back, ~good)
     dz = back - work.z
     # All inner products of the iteration except those with the memory, as one batched product.
     left = jnp.stack([step, dz, back], axis=1)
     products = jnp.einsum("wiak,wjak->wij", left, right, precision="highest")
-    # A refused step costs its evaluation and clears the memory. The step of ``plain`` that follows
+    # A refused step costs its evaluation and clears the memory. The safe step that follows
     # cannot raise the energy, so a second refusal in a row is due to rounding.
     stalled = work.stalled | (~good & work.refused)
     memory = _remember(work.memory, tick, good & ~first, good, step, dz, g, products)

@@ -12,7 +12,7 @@ Tree = TypeVar("Tree")
 _SHARE, _SHORTEST, _LONGEST = 0.03, 2e-5, 5e-3
 
 
-def settled(tree: Tree) -> Tree:
+def wait_for(tree: Tree) -> Tree:
     """Return the arrays of a tree once they are there.
 
     JAX hands out arrays before they are computed. Whoever then reads one waits inside JAX, and a

@@ -16,6 +16,11 @@ from jaxtyping import Array, Bool, Float
 from jaxdeform._arrays import is_concrete
 
 
+def has_accelerator() -> bool:
+    """Whether calls back to the host would cost more than the products that avoid them."""
+    return jax.default_backend() != "cpu"
+
+
 def total(x: Float[Array, "*shape"], batch: int | None = None) -> Float[Array, "*batch"]:
     """Return the sum of all entries, or of those of each batch member (the last part of an axis).
 

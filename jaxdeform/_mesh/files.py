@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._arrays import read_host_array
-from jaxdeform._checks import check_rigidity, check_type, read_path
+from jaxdeform._checks import check_type, read_path
 from jaxdeform._errors import ArrayLike, InputError, printable
 from jaxdeform._mesh.extras import file_extras, of_own_format
 from jaxdeform._mesh.formats import FORMATS
@@ -23,6 +23,7 @@ from jaxdeform._mesh.polygons import from_triangles, triangles
 from jaxdeform._mesh.reading import mark_of, read_bytes, without_mark
 from jaxdeform._mesh.stl import check_stl, is_binary
 from jaxdeform._mesh.writing import check_place, write_atomically
+from jaxdeform._values import read_rigidity
 
 # Cutting ears takes time by the square of the corners: 5,000 take half a second.
 _MOST_CORNERS = 5_000
@@ -131,7 +132,7 @@ def save_mesh(
         if suffix != ".ply":
             raise InputError(f"{path}: only PLY carries rigidity per vertex: use a .ply name")
         rigidity = read_host_array(rigidity, np.float64, "rigidity")
-        rigidity = np.asarray(check_rigidity(rigidity, mesh.n_vertices, rigidity.dtype))
+        rigidity = np.asarray(read_rigidity(rigidity, mesh.n_vertices, rigidity.dtype))
     content = _content(path, suffix, mesh, points, rigidity)
     if path.suffix.lower() == ".gz":
         content = gzip.compress(content, mtime=0)
@@ -218,7 +219,7 @@ def load_rigidity(path: str | os.PathLike[str]) -> Float[np.ndarray, "vertices"]
         )
     values = columns["rigidity"]
     try:
-        check_rigidity(values, len(values), values.dtype)
+        read_rigidity(values, len(values), values.dtype)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return values

@@ -6,12 +6,13 @@ Each function returns a `Selection`, which ``|``, ``&``, ``-`` and ``~`` combine
 import numpy as np
 
 from jaxdeform._arrays import read_host_array
-from jaxdeform._checks import check_count, check_tolerance, check_type, read_axis
+from jaxdeform._checks import check_count, check_tolerance, check_type
 from jaxdeform._errors import ArrayLike, InputError, shown
 from jaxdeform._mesh.expressions import matching
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.nearby import within_distance
 from jaxdeform._mesh.selection import Selection, ranges, read_mask, read_vertices
+from jaxdeform._values import read_axis
 
 __all__ = [
     "border",

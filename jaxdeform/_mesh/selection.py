@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxdeform._arrays import read_integers, read_numbers, read_only
-from jaxdeform._checks import check_index, check_labels, check_type
+from jaxdeform._checks import check_index, check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.mesh import Mesh
+from jaxdeform._values import read_labels
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -217,7 +218,7 @@ def check_parts(parts: ArrayLike, mesh: Mesh) -> Int[np.ndarray, "vertices"]:
     """Return the part of each vertex, or raise InputError naming what is wrong."""
     given, n = read_mask_or_numbers("parts", parts, mesh), mesh.n_vertices
     label = given.astype(int) if given.dtype == bool else given
-    label = check_labels("parts", label, n, "vertex", n)
+    label = read_labels("parts", label, n, "vertex", n)
     missing = np.setdiff1d(np.arange(label.max() + 1), label)
     if missing.size:
         raise InputError(

@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._arrays import read_only
-from jaxdeform._checks import check_type, read_host_positions
+from jaxdeform._checks import check_type
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._mesh.cells import Cells, rings
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.selection import read_mask
+from jaxdeform._values import read_host_positions
 
 
 @dataclass(frozen=True, eq=False)

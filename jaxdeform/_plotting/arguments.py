@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxdeform._arrays import read_host_array
-from jaxdeform._checks import check_flag, check_type, read_axis
+from jaxdeform._checks import check_flag, check_type
 from jaxdeform._errors import InputError, a_or_an, shown
 from jaxdeform._mesh.extras import file_colors
 from jaxdeform._mesh.mesh import Mesh
@@ -17,6 +17,7 @@ from jaxdeform._plotting.camera import guess_up
 from jaxdeform._plotting.color import NEUTRAL, Scale, rgb, scale_of
 from jaxdeform._plotting.scene import Dots
 from jaxdeform._plotting.surface import Coat, Surface
+from jaxdeform._values import read_axis
 
 STRETCH = "stretch"
 

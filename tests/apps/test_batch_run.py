@@ -17,7 +17,7 @@ import jaxdeform as jd
 from jaxdeform._apps.batch import run as runs
 from jaxdeform._apps.batch import store, summary
 from jaxdeform._apps.batch.manifest import read_manifest
-from jaxdeform._apps.batch.worker import Settings, run_block
+from jaxdeform._apps.batch.worker import WorkerSettings, run_block
 
 KILLS = int(os.environ.get("JAXDEFORM_KILLS", "20"))
 
@@ -53,8 +53,8 @@ def jobs(folder):
     return read_manifest(folder / "jobs.jsonl")
 
 
-def settings(run, session="a", tries=3) -> Settings:
-    return Settings(str(run), session, tries, 600.0, False)
+def settings(run, session="a", tries=3) -> WorkerSettings:
+    return WorkerSettings(str(run), session, tries, 600.0, False)
 
 
 def do_all(run, jobs, session="a"):

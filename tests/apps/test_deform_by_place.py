@@ -177,3 +177,34 @@ def test_a_file_and_expressions_count_the_same(deform, tmp_path):
     assert by_file.split("\n")[0] == by_place.split("\n")[0] == counts
     np.testing.assert_array_equal(jd.load_mesh("out.obj").vertices, first)
     assert jax.config.jax_enable_x64
+
+
+def test_a_rotation_of_what_lies_on_its_axis_is_refused(deform):
+    """One vertex, or a line of them along z."""
+    mesh = jd.load_mesh("bar.obj")
+    x, y, z = mesh.vertices[300]
+    one = f"x>{x - 1e-4} and x<{x + 1e-4} and y>{y - 1e-4} and y<{y + 1e-4}"
+    alone = f"{one} and z>{z - 1e-4} and z<{z + 1e-4}"
+    code, _, err = deform("--fix", "y<0.1", "--move", alone, "--rotate", "z", 60)
+    assert code == 2
+    assert "lie on the axis, which goes through their middle, so nothing moves: give --about" in err
+    code, _, err = deform(
+        "--fix", "y<0.1", "--move", alone, "--rotate", "z", 60, "--about", 0, 0, 0, "--steps", 2
+    )
+    assert (code, err) == (0, "")
+
+
+@pytest.mark.filterwarnings("always:negative weights")
+def test_a_warning_is_a_line_of_the_command(run, tmp_path):
+    """Without the line of Python that it comes from. The bar is sheared, for obtuse angles."""
+    bar = jd.shapes.bar()
+    jd.save_mesh(
+        tmp_path / "m.off", jd.Mesh(bar.vertices @ [[1, 0, 0], [1.5, 1, 0], [0, 0, 1]], bar.faces)
+    )
+    code, _, err = run(
+        "deform", tmp_path / "m.off", "-o", tmp_path / "o.off", "--fix", "y<6",
+        "--move", "y>145", "--translate", 0, 9, 0, "--steps", 2,
+    )  # fmt: skip
+    assert code == 0
+    assert err.startswith("jaxdeform: negative weights (obtuse angles) leave the energy of 196")
+    assert len(err.splitlines()) == 1

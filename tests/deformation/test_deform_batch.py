@@ -88,8 +88,11 @@ def test_what_does_not_fit_together_is_named(plate):
     problem, targets, rigidity = plate
     n = problem.n_vertices
     for message, arguments in {
-        rf"rigidity are for {n} members, but targets for 11.*\(1, {n}\)": (targets, np.ones(n)),
-        "rigidity are for 11 members, but targets for 3": (targets[:3], rigidity),
+        rf"rigidity has {n} members, but targets have 11: give as many.*\(1, {n}\)": (
+            targets,
+            np.ones(n),
+        ),
+        "rigidity has 11 members, but targets have 3": (targets[:3], rigidity),
         r"targets have shape \(11, 7, 3\): give \(batch, 8, 3\)": (targets[:, :7], rigidity),
         r"targets have shape \(0, 8, 3\).*at least one": (targets[:0], 1.0),
     }.items():

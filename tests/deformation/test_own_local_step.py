@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FD, held_sheet
+from helpers import FD, ends, held_sheet
 
 import jaxdeform as jd
 
@@ -133,7 +133,31 @@ class Forgetful(Corotated):
         return None
 
 
+class SumOfEnergies(jd.Newton):
+    def energy(self, t, c, b, rigidity):
+        return jnp.sum(super().energy(t, c, b, rigidity))
+
+
+class Wordy(Corotated):
+    def energy(self, t, c, b, rigidity):
+        return "much"
+
+
+class StrainOfAxes(Corotated):
+    def strain_rigidity(self, rigidity):
+        return jnp.stack([rigidity] * 3)
+
+
+class StrainOfNothing(Corotated):
+    def strain_rigidity(self):
+        return 1.0
+
+
 WRONG = {
+    r"SumOfEnergies.energy returned float64\[\] for 5 cells": SumOfEnergies(),
+    "Wordy.energy returned a str for 5 cells": Wordy(),
+    r"StrainOfAxes.strain_rigidity returned float64\[3, 5\]": StrainOfAxes(),
+    r"StrainOfNothing.strain_rigidity cannot be called with \(rigidity\)": StrainOfNothing(),
     "text 'arap': give a local step, such as .*RotationFit": "arap",
     r"class RotationFit: give RotationFit\(\) instead": jd.RotationFit,
     "local is None, without minimize: give a local step": None,
@@ -144,6 +168,20 @@ WRONG = {
     "Single.minimize returned .*float32": Single(),
     "Forgetful.with_implicit_derivative returned None": Forgetful(),
 }
+
+
+class Double(Corotated):
+    def energy(self, t, c, b, rigidity):
+        return super().energy(t, c, b, rigidity).astype(jnp.float64)
+
+
+def test_a_law_is_asked_for_the_type_of_the_problem(bar):
+    """Which may be float32 where JAX computes in float64."""
+    problem = jd.precompute(bar, ends(bar), dtype=np.float32)
+    targets = jd.bend(bar.vertices[ends(bar)], 20.0)
+    assert bool(jd.deform(problem, targets, 1.0, local=Corotated()).ok)
+    with pytest.raises(jd.InputError, match=r"Double.energy returned float64\[5\]"):
+        jd.deform(problem, targets, 1.0, local=Double())
 
 
 @pytest.mark.parametrize("message", WRONG)

@@ -50,7 +50,7 @@ def test_where_noise_hides_the_handles_that_is_said(rest, pose):
 
 @pytest.mark.parametrize("rigidity", [0.1, 30.0])
 def test_few_handles_of_an_exact_pose_are_found(bar, rigidity):
-    """Two vertices with their neighbors: fewer rings than the noise is taken from."""
+    """Two vertices with their neighbours: fewer rings than the noise is taken from."""
     rings = [np.append(bar.edges[(bar.edges == k).any(axis=1)].ravel(), k) for k in (200, 500)]
     lower, upper = map(np.unique, rings)
     handles = np.concatenate([lower, upper])

@@ -149,7 +149,7 @@ def interrupted(file: Path, kind: int) -> None:
     def press() -> None:
         main = threading.main_thread().ident
         names: list[str] = []
-        while "settled" not in names:
+        while "wait_for" not in names:
             time.sleep(0.01)
             frame, names = sys._current_frames()[main], []
             while frame is not None:

@@ -11,12 +11,12 @@ from distributed.scheduler import KilledWorker
 
 import jaxdeform as jd
 from jaxdeform._apps.batch.store import Block
-from jaxdeform._apps.batch.worker import Settings, run_block
+from jaxdeform._apps.batch.worker import WorkerSettings, run_block
 
 
 def work_off(
     blocks: list[Block],
-    settings: Settings,
+    settings: WorkerSettings,
     scheduler: str | None,
     workers: int,
     tell: Callable[[int], Any],
@@ -52,7 +52,7 @@ def work_off(
 
 @contextmanager
 def _client(
-    scheduler: str | None, workers: int, settings: Settings, say: Callable[[str], Any]
+    scheduler: str | None, workers: int, settings: WorkerSettings, say: Callable[[str], Any]
 ) -> Iterator[Client]:
     """Connect to the scheduler, or start workers of our own, which only this machine can reach."""
     for name in ("distributed", "tornado", "asyncio"):  # a lost worker is part of the plan

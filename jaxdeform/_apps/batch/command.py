@@ -107,13 +107,13 @@ def _export(run: str, folder: Path, suffix: str) -> None:
 
 def _run(manifest: Path, out: str, options: _Options) -> None:
     from jaxdeform._apps.batch import run, summary
-    from jaxdeform._apps.batch.worker import Settings
+    from jaxdeform._apps.batch.worker import WorkerSettings
 
     began = time.perf_counter()
     jobs = read_manifest(manifest)
     root = patiently("planning", lambda: run.planned(out, jobs))
     cache = bool(jax.config.values.get("jax_compilation_cache_dir"))  # cli.py has set it
-    settings = Settings(out, run.new_session(), options.tries, options.time_limit, cache)
+    settings = WorkerSettings(out, run.new_session(), options.tries, options.time_limit, cache)
     go_on = partial(run.go_on, root, jobs, settings, options.scheduler, options.workers)
     worked = counted("jobs", len(jobs), lambda tell: go_on(tell, console.print))
     if worked or not summary.has_tables(out, options.csv):

@@ -9,7 +9,7 @@ import jaxdeform as jd
 from jaxdeform._apps.batch import store
 from jaxdeform._apps.batch.manifest import Job
 from jaxdeform._apps.batch.store import Root
-from jaxdeform._apps.batch.worker import Settings
+from jaxdeform._apps.batch.worker import WorkerSettings
 
 
 def planned(run: str, jobs: list[Job]) -> Root:
@@ -37,7 +37,7 @@ def _holds_something(run: Path) -> bool:
 def go_on(
     root: Root,
     jobs: list[Job],
-    settings: Settings,
+    settings: WorkerSettings,
     scheduler: str | None,
     workers: int,
     tell: Callable[[int, int], Any],

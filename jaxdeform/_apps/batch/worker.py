@@ -14,7 +14,7 @@ from jaxdeform._apps.batch import store
 from jaxdeform._apps.batch.work import Done, do
 
 
-class Settings(NamedTuple):
+class WorkerSettings(NamedTuple):
     """How a run goes; another run of the same jobs may have other ones."""
 
     run: str
@@ -26,7 +26,7 @@ class Settings(NamedTuple):
     cache: bool
 
 
-def run_block(block: store.Block, settings: Settings) -> int:
+def run_block(block: store.Block, settings: WorkerSettings) -> int:
     """Do the jobs of a block that is not done yet, write the results, and return their number."""
     jax.config.update("jax_enable_x64", True)
     if settings.cache:

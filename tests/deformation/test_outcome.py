@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxdeform as jd
 from jaxdeform._deformation.descent import Descent
+from jaxdeform._deformation.outcome import outcome_of
 from jaxdeform._deformation.reduced_energy import Inputs
-from jaxdeform._deformation.verdict import verdict
 
 R = jd.Result
 
@@ -52,7 +52,7 @@ def test_an_end_out_of_proportion_is_no_result(sheet):
         history = jnp.asarray([1.0, energy])
         t = jnp.broadcast_to(jnp.eye(3)[..., None], (3, *system.rest.shape))
         end = Descent(positions, t, history, jnp.asarray(1, jnp.int32), R.converged)
-        return verdict(system, inputs, end)
+        return outcome_of(system, inputs, end)
 
     assert of(system.rest, 0.5) == R.converged
     assert of(system.rest, -1e-13) == R.converged  # rounding

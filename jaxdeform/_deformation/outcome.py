@@ -12,7 +12,7 @@ from jaxdeform._result import Result
 _FAR = 10.0
 
 
-def verdict(system: System, inputs: Inputs, end: Descent) -> Result:
+def outcome_of(system: System, inputs: Inputs, end: Descent) -> Result:
     """Return the result of a descent: its own, unless the input or the end is no good.
 
     Inside jit the values of arguments cannot be checked by an exception, so they are here.
@@ -33,8 +33,9 @@ def verdict(system: System, inputs: Inputs, end: Descent) -> Result:
         & jnp.all((inputs.soft >= 0) & (inputs.soft <= system.soft))
     )
     if inputs.geometry is not None:
-        off = jnp.abs(inputs.geometry.rest - system.rest)
-        valid &= jnp.all(off <= 1e-6 * jnp.max(jnp.abs(system.rest)))
+        given = inputs.geometry
+        for value, own in ((given.rest, system.rest), (given.weights, given.graph.weights)):
+            valid &= jnp.all(jnp.abs(value - own) <= 1e-6 * jnp.max(jnp.abs(own)))
     result = Result.where(finite & ~proportionate, Result.out_of_proportion, end.result)
     result = Result.where(finite, result, Result.not_finite)
     return Result.where(valid, result, Result.bad_input)
