@@ -6,6 +6,7 @@ are evaluated at the rest shape of the problem only, and only for a derivative: 
 known. The principal axes of the cells stay as they are; they are a choice of coordinates.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -140,14 +141,27 @@ class GeometryMaps(NamedTuple):
         return _EdgeStiffness(self.system, self.geometry)
 
     def moment_change(self) -> Float[Array, "3 3 vertices"]:
-        """Return B in the cells' principal axes minus itself: 0, with the derivatives of B."""
+        """Return B in the cells' principal axes minus itself: 0, with two derivatives of B."""
         graph = self.geometry.graph
         edge = _difference(self.geometry.rest, graph)
         outer = self.geometry.weights[None, None] * edge[:, None] * edge[None]
         b = _into_cells(outer, graph, self.system.principal_moments.shape[1])
         axes = self.system.principal_axes
         b = jnp.einsum("iak,ijk,jbk->abk", axes, b, axes, precision="highest")
-        return b - jax.lax.stop_gradient(b)
+        return _differentiable(b - jax.lax.stop_gradient(b), 2)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _differentiable(x: Float[Array, "3 3 vertices"], times: int) -> Float[Array, "3 3 vertices"]:
+    """Return x, which may be differentiated so many times (the evaluation is right that far)."""
+    return x
+
+
+@_differentiable.defjvp
+def _differentiable_jvp(times, primals, tangents):
+    if not times:
+        raise InputError("rest and edge_weights have first and second derivatives only")
+    return _differentiable(primals[0], times - 1), tangents[0]
 
 
 class _EdgeCovariance(NamedTuple):

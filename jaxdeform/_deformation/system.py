@@ -99,7 +99,7 @@ def build_system(
         factor=factor,
         initial_guess=laplacian_guess(cells, unled, dtype),
         fingerprint=jax.device_put(fingerprint(cells)),
-        seal=jnp.zeros(2, jnp.uint32),
+        seal=jax.device_put(np.zeros(2, np.uint32)),
         faces=jax.device_put(faces),
         sides=None if sides is None else put(sides),
     )

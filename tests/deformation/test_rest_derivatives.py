@@ -145,6 +145,23 @@ def test_another_rest_shape_is_refused_and_said_inside_jit(case):
     run = jax.jit(lambda rest: jd.deform(problem, targets, 1.0, rest=rest).result)
     assert run(jnp.asarray(other)) == jd.Result.bad_input
     assert run(jnp.asarray(mesh.vertices)) == jd.Result.converged
+    run = jax.jit(lambda weights: jd.deform(problem, targets, 1.0, edge_weights=weights).result)
+    assert run(jnp.asarray(problem.cells.weights + 1.0)) == jd.Result.bad_input
+    assert run(jnp.asarray(problem.cells.weights)) == jd.Result.converged
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [jax.jacfwd, jax.grad])
+def test_third_derivatives_to_the_rest_shape_raise(case, first):
+    mesh, handles, targets, _, weight, direction = case
+    problem = jd.precompute(mesh, handles)
+
+    def loss(x):
+        rest = jnp.asarray(mesh.vertices) + x * direction
+        return value(jd.deform(problem, targets, 0.7, rest=rest), weight)
+
+    with pytest.raises(jd.InputError, match="first and second derivatives only"):
+        jax.make_jaxpr(jax.jacfwd(jax.jacfwd(first(loss))))(0.0)
 
 
 def test_what_has_no_derivative_raises(case):
