@@ -56,6 +56,11 @@ def test_inside_jit_arrays_of_another_problem_end_in_bad_input(
     stack = jax.tree.map(lambda *x: jnp.stack(x), mixed, mixed)
     both = jax.vmap(lambda problem: jd.deform(problem, bar_targets, 1.0))(stack)
     assert not both.ok.any()
+    stack = jax.tree.map(lambda *x: jnp.stack(x), bar_problem, bar_problem)
+    both = jax.vmap(lambda problem: jd.deform(problem, bar_targets, 1.0))(stack)
+    assert both.ok.all()
+    want = np.broadcast_to(jd.deform(bar_problem, bar_targets, 1.0).vertices, both.vertices.shape)
+    np.testing.assert_allclose(both.vertices, want, atol=1e-9 * bar.diagonal)
 
 
 def changed(bar, problem):
