@@ -270,8 +270,12 @@ def test_a_thousand_bends(run):
         alone="[[bend(a, m).vertices for m in materials[:2]] for a in angles[:2]]",
         slope="by_gradient",
         difference="by_differences",
+        listed="listed.vertices",
     )
     assert got["ok"].all()
+    np.testing.assert_allclose(
+        got["listed"].reshape(got["poses"].shape), got["poses"], atol=1e-9 * np.ptp(got["rest"])
+    )
     diagonal = np.linalg.norm(np.ptp(got["rest"], axis=0))
     assert np.abs(got["poses"][:2, :2] - got["alone"]).max() < 1e-3 * diagonal  # what solvers leave
     for poses, angle, left in zip(got["poses"], got["angles"], got["left"], strict=True):

@@ -49,7 +49,8 @@ def sr_arap(
     ``alpha sum_{edges ij} b_ij |R_i - R_j|_F^2`` with ``b_ij = area (1 / n_i + 1 / n_j) / 2``:
     area is that of the mesh, n_i the number of neighbours of vertex i. Where all vertices have the
     same number of neighbours, alpha is that of CGAL. (CGAL gives vertex i the weight ``1 / n_i``
-    alone, so that its steps are no descent of an energy.)
+    alone, so that its steps are no descent of an energy. On the cactus, whose vertices differ, the
+    ends at 0.02 lie 8e-5 of the diagonal apart, those at 0 4e-8, with the edge weights of CGAL.)
 
     Local and global steps alternate, and no step raises the energy. Unlike `arap`, it does not
     look whether the end is a saddle.

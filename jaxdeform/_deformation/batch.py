@@ -30,8 +30,10 @@ from jaxdeform._result import check_result
 # what the compiler keeps of them meanwhile.
 _NUMBERS = 40
 # Chunks that are computed at the same time. While one is at its end, where few members are left, or
-# is copied, the other keeps the cores busy.
+# is copied, the other keeps the cores busy. That pays for many members: two chunks take 0.93 of the
+# time of one for 1,024 and 256 bars, but 1.05 for 64, and 1.15 for 64 tubes of 5,000 vertices.
 _IN_FLIGHT = 2
+_MANY = 16 * SLOTS
 
 MEMORY = 2**30
 
@@ -217,7 +219,7 @@ def _size_of_chunk(problem: Problem, size: int, memory: int) -> int:
     member = _NUMBERS * problem.n_vertices * problem.dtype.itemsize
     most = max(1, memory // (member * _IN_FLIGHT)) * devices
     count = -(-size // most)
-    if size >= 2 * SLOTS * devices:  # enough for each chunk to keep its queue full
+    if size >= _MANY * devices:
         count = max(count, _IN_FLIGHT)
     return -(-size // (count * devices)) * devices
 
