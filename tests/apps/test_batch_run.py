@@ -1,11 +1,13 @@
 """A batch run: the results are those of deform, and nothing is lost or done twice."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -273,6 +275,38 @@ def test_killed_at_any_moment(folder, jobs, tmp_path):
     last = subprocess.run(words, capture_output=True, text=True, timeout=600)
     assert last.returncode == 0, last.stderr
     check_same(contents(store.find(str(run))), want)
+
+
+def mounted(place: Path, size: str) -> bool:
+    """Mount a disk of this size, or enlarge it; False where that is not allowed."""
+    place.mkdir(exist_ok=True)
+    option = f"{'remount,' if place.is_mount() else ''}size={size}"
+    words = ["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(place)]
+    with contextlib.suppress(OSError):
+        return subprocess.run(words, capture_output=True).returncode == 0
+    return False
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full(folder, tmp_path):
+    """Nothing is lost: the same command goes on when there is room."""
+    disk, rows = tmp_path / "disk", [job(k, (k % 20) / 10, 0.05) for k in range(200)]
+    write(folder / "full.jsonl", rows)
+    want = contents(do_all(tmp_path / "unbroken", read_manifest(folder / "full.jsonl")))
+    if not mounted(disk, "200k"):
+        pytest.skip("no disk can be mounted here")
+    try:
+        words = command(folder / "full.jsonl", "-o", disk / "run", "--workers", 1)
+        ran = subprocess.run(words, capture_output=True, text=True, timeout=600)
+        assert ran.returncode == 2
+        assert "No space left on device" in ran.stderr
+        assert "run the same command again" in ran.stderr
+        assert mounted(disk, "64m")
+        ran = subprocess.run(words, capture_output=True, text=True, timeout=600)
+        assert ran.returncode == 0, ran.stderr
+        check_same(contents(store.find(str(disk / "run"))), want)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
 
 
 @pytest.mark.slow
