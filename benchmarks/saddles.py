@@ -55,9 +55,10 @@ def motions(rest: np.ndarray, length: float) -> Iterator[tuple[str, np.ndarray]]
 def count(mesh: jd.Mesh) -> Counter[str]:
     """Deform the mesh in all ways, and count how it ended."""
     handles = jd.select.where(mesh, "v < 0.06 or v > 0.94")
-    problems = {jd.Newton(): jd.precompute(mesh, handles)}
+    problems: dict[jd.LocalStep, jd.Problem] = {jd.Newton(): jd.precompute(mesh, handles)}
     problems[jd.RotationFit()] = jd.precompute(mesh, handles, cells=jd.spokes(mesh))
-    settings = [(jd.Newton(), material) for material in MATERIALS] + [(jd.RotationFit(), 0.0)]
+    settings: list[tuple[jd.LocalStep, float]] = [(jd.RotationFit(), 0.0)]
+    settings += [(jd.Newton(), material) for material in MATERIALS]
     random, found = np.random.default_rng(0), Counter()
     rest, length = mesh.vertices[handles.vertices], float(np.ptp(mesh.vertices[:, 1]))
     for _, targets in motions(rest, length):

@@ -13,7 +13,7 @@ from jaxdeform._deformation.arguments import (
     read_vertices,
 )
 from jaxdeform._deformation.local_step import LocalStep, Newton
-from jaxdeform._deformation.metric import apply_metric, metric_of
+from jaxdeform._deformation.metric import metric_of
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.saddles import lowest_curvature
@@ -72,7 +72,6 @@ def _look(
     p = jnp.where(system.free[None], shape, inputs.targets)
     at = energy.evaluate(system, inputs, p)
     metric = metric_of(system, energy.local, inputs.rigidity)
-    gain = jnp.sum(at.gradient * apply_metric(system, metric, at.gradient))
-    stationary = gain <= _STATIONARY * jnp.abs(at.energy) + at.rounding
-    value, _ = lowest_curvature(energy, system, inputs, metric, p, at.transforms, most=_MOST)
-    return stationary & (value >= 0.0)
+    found = lowest_curvature(energy, system, inputs, metric, p, at.transforms, most=_MOST)
+    stationary = found.gain <= _STATIONARY * jnp.abs(at.energy) + at.rounding
+    return stationary & (found.value >= 0.0)

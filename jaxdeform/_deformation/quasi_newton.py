@@ -41,9 +41,10 @@ class QuasiNewton:
       this rigidity. It needs 1/3 to 1/30 of the steps where materials are soft, and its solves take
       2 to 4 times as long. ``"auto"``: the second where a tenth of the cells is softer than a
       constant of 1 (`rigidity_from_material`), on a CPU.
-    - leave_saddles: look for a direction of negative curvature at the end, and go on along it. It
-      costs 4 to 24 products with the Hessian, a quarter of the steps taken. Without it a symmetric
-      deformation may end at a saddle and say 'Converged'.
+    - leave_saddles: look for a direction of negative curvature at the end, and go on along it; in
+      a direction of nearly none, go on by a lower tolerance. It costs 4 to 24 products with the
+      Hessian, a quarter of the steps taken. Without it a symmetric deformation may end at a saddle
+      and say 'Converged'.
     - can_unroll, needs_one_energy: see `Solver`.
 
     Example:
@@ -94,13 +95,13 @@ class QuasiNewton:
             return jax.vmap(apply_metric, in_axes=(None, 0, 0, 0))(system, own[1], gradient, safe)
 
         function = Function(evaluate, apply)
-        descend = lambda start: minimize(function, system, (inputs, metric), start, settings)  # noqa: E731
+        descend = partial(minimize, function, system, (inputs, metric))
         if self.leave_saddles:
             look = partial(lowest_curvature, energy, system, inputs, metric)
             size = jnp.sqrt(jnp.sum(jnp.ptp(system.rest, axis=1) ** 2))
             end, at_saddle = leave_saddles(descend, look, start, size, settings)
         else:
-            end, at_saddle = descend(start), jnp.asarray(False)
+            end, at_saddle = descend(start, settings), jnp.asarray(False)
         result = Result.where(end.converged, Result.converged, Result.step_limit)
         result = Result.where(at_saddle, Result.saddle, result)
         return Descent(end.p, end.transforms, end.energy, end.steps, result)

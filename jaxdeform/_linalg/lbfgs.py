@@ -37,7 +37,7 @@ VERTICES_AT_ONCE = 1 << 22
 class LbfgsSettings(NamedTuple):
     """When to stop, and how many steps to remember; see `QuasiNewton`."""
 
-    tolerance: float
+    tolerance: float | Float[Array, "*members"]
     max_steps: int
     history_length: int
 
@@ -89,7 +89,7 @@ class Minimum(NamedTuple):
         )
 
 
-def has_converged(gain, energy, rounding, tolerance: float) -> Bool[Array, "..."]:
+def has_converged(gain, energy, rounding, tolerance) -> Bool[Array, "..."]:
     """Return whether the step -H^-1 g would gain less than the tolerance, or than rounding hides.
 
     The gain <g, H^-1 g> is a square, so it is known far more exactly than the energy itself.
@@ -105,24 +105,24 @@ def minimize(
     start: Float[Array, "3 vertices"],
     settings: LbfgsSettings,
 ) -> Minimum:
-    """Minimise from a start. Under vmap over ``inputs`` and ``start``, run the batch as a queue."""
+    """Minimise from a start. Under vmap over all but the system, run the batch as a queue."""
 
     @custom_vmap
-    def batch(system, inputs, start):
-        return _run_queue(function, system, inputs, start, settings)
+    def batch(system, inputs, start, tolerance):
+        return _run_queue(function, system, inputs, start, settings._replace(tolerance=tolerance))
 
     @batch.def_vmap
     def larger_batch(size, is_batched, system, *own):
         if not is_shared(is_batched[0]):
             return one_by_one(batch, size, is_batched, (system, *own))
         own = spread_over_members(size, tuple(is_batched[1:]), own)
-        each = own[-1].shape[1]
+        each = own[1].shape[1]
         flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
         out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), batch(system, *flat))
         return out, jax.tree.map(lambda _: True, out)
 
-    one = jax.tree.map(lambda x: x[None], (inputs, start))
-    return jax.tree.map(lambda x: x[0], batch(system, *one))
+    own = inputs, start, jnp.asarray(settings.tolerance, start.dtype)
+    return jax.tree.map(lambda x: x[0], batch(system, *jax.tree.map(lambda x: x[None], own)))
 
 
 class _Memory(NamedTuple):
@@ -181,7 +181,7 @@ class _Queue(NamedTuple):
 
 
 def _run_queue(function, system, inputs, start, settings: LbfgsSettings) -> Minimum:
-    count = start.shape[0]
+    count, tolerance = start.shape[0], jnp.asarray(settings.tolerance)  # one for each member
     most = max(SLOTS, VERTICES_AT_ONCE // start.shape[2]) if has_accelerator() else SLOTS
     slots = min(count, most)
     out = Minimum.unknown(start, settings)
@@ -194,13 +194,14 @@ def _run_queue(function, system, inputs, start, settings: LbfgsSettings) -> Mini
     def finish_some(queue: _Queue) -> _Queue:
         """Iterate until a member is done; store its result and start the next one."""
         member = queue.member
-        own = jax.tree.map(lambda x: x.at[member].get(mode="clip"), inputs)
-        advance = partial(_advance, function, system, own, settings)
+        pick = lambda x: x.at[member].get(mode="clip")  # noqa: E731
+        own, limits = jax.tree.map(pick, inputs), settings._replace(tolerance=pick(tolerance))
+        advance = partial(_advance, function, system, own, limits)
         idle = member >= count
-        busy = lambda s: ~jnp.any(_done(s[1], settings) & ~idle)  # noqa: E731
+        busy = lambda s: ~jnp.any(_done(s[1], limits) & ~idle)  # noqa: E731
         tick, work = jax.lax.while_loop(busy, lambda s: advance(*s), (queue.tick, queue.work))
-        done = _done(work, settings) & ~idle
-        ended = work.stalled | _converged(work, settings)
+        done = _done(work, limits) & ~idle
+        ended = work.stalled | _converged(work, limits)
         transforms = jnp.moveaxis(work.at.transforms, -1, 0)
         found = Minimum(work.p, transforms, work.history, work.iteration - 1, ended)
         place, rank = jnp.where(done, member, count), jnp.cumsum(done, dtype=jnp.int32)
