@@ -328,14 +328,14 @@ def good_calls(folder: Path) -> dict:
 
 
 OF_KIND = {
-    "numbers": "above base below center centers constant controls deformed degrees distances "
+    "numbers": "above alpha base below center centers constant controls deformed degrees distances "
     "edge_weights field handle_weights high interval low observed offset point points power rest "
     "rigidity rotations start targets transforms translations vertices weights",
     "indices": "faces group parts r",
     "vertices": "free handles moved sources",
     "count": "columns count history_length k memory max_evaluations max_steps n_vertices steps "
     "width",
-    "tolerance": "alpha determined_within distance radius seconds smoothness step_size "
+    "tolerance": "determined_within distance radius seconds smoothness step_size "
     "target_noise threshold tolerance",
     "path": "path motion",
     "setting": "adjoint local solver",

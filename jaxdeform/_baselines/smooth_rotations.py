@@ -3,7 +3,7 @@
 The energy is Eq. 3.3 with a second term, in which the rotations of neighbours pull at each other:
 
     E(p', R) = sum_i sum_{j in N(i)} w_ij |e'_ij - R_i e_ij|^2
-               + alpha sum_{edges ij} b_ij |R_i - R_j|_F^2.
+               + sum_{edges ij} (alpha_i + alpha_j) / 2 b_ij |R_i - R_j|_F^2.
 
 The local step fits all rotations at once, to the positions and to the rotations of the last
 iteration. Taken alone that can raise the energy: two neighbours may exchange their rotations for
@@ -47,12 +47,13 @@ class SmoothEnergy(NamedTuple):
 
     system: System
     coupling: EllMatrix
-    """b, with its row sums on the diagonal."""
+    """a_ij = (alpha_i + alpha_j) / 2 b_ij, with its row sums on the diagonal."""
     row_sum: Float[Array, "vertices"]
-    alpha: Float[Array, ""]
 
     @staticmethod
-    def build(system: System, mesh: Mesh, alpha: float, dtype: np.dtype) -> "SmoothEnergy":
+    def build(
+        system: System, mesh: Mesh, alpha: Float[np.ndarray, "vertices"], dtype: np.dtype
+    ) -> "SmoothEnergy":
         """Return the energy with ``b_ij = area (1 / n_i + 1 / n_j) / 2``.
 
         area is that of the mesh, n_i the number of neighbours of vertex i. The unit of b is that
@@ -62,19 +63,19 @@ class SmoothEnergy(NamedTuple):
         area = np.linalg.norm(triangle_area_vectors(mesh.vertices, mesh.faces), axis=1).sum()
         neighbours = np.bincount(mesh.edges.ravel(), minlength=n)
         b = 0.5 * area * (1.0 / neighbours[i] + 1.0 / neighbours[j])
-        upper = sp.coo_matrix((b, (i, j)), (n, n))
+        upper = sp.coo_matrix((0.5 * (alpha[i] + alpha[j]) * b, (i, j)), (n, n))
         both = upper + upper.T
         row_sum = np.asarray(both.sum(axis=1)).ravel()
         size = system.rest.shape[-1]
         coupling = EllMatrix.build([[enlarge(both + sp.diags(row_sum), size)]], dtype)
         sums = jax.device_put(fill_up(row_sum, size).astype(dtype))
-        return SmoothEnergy(system, coupling, sums, jnp.asarray(alpha, dtype))
+        return SmoothEnergy(system, coupling, sums)
 
     def pull(self, t: Float[Array, "3 3 v"]) -> Float[Array, "3 3 v"]:
-        """Return ``alpha sum_j b_ij (R_j + R_i)``: a symmetric and semidefinite map of R."""
+        """Return ``sum_j a_ij (R_j + R_i)``: a symmetric and semidefinite map of R."""
         axes = self.system.principal_axes
         world = jnp.einsum("aik,jik->ajk", t, axes, precision="highest")
-        world = self.alpha * self.coupling.apply(world)
+        world = self.coupling.apply(world)
         return jnp.einsum("ajk,jik->aik", world, axes, precision="highest")
 
     def value(
@@ -86,7 +87,7 @@ class SmoothEnergy(NamedTuple):
         cells = jnp.sum(cell_energies(t, c, system.principal_moments, none))
         stretch = jnp.sum(p * system.stiffness.apply(p))
         # |R_i - R_j|^2 = |R_i|^2 + |R_j|^2 - 2 <R_i, R_j>; every edge has two ends.
-        twice = 2.0 * self.alpha * jnp.sum(self.row_sum[None, None] * t * t)
+        twice = 2.0 * jnp.sum(self.row_sum[None, None] * t * t)
         rounding = 20.0 * jnp.finfo(p.dtype).eps * (stretch + twice)
         return stretch + cells + twice - jnp.sum(t * pull), rounding
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdeform._arrays import read_host_array
 from jaxdeform._baselines.smooth_rotations import (
     SmoothEnergy,
     to_convergence,
@@ -27,13 +28,14 @@ from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._mesh.cells import spokes
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._result import check_result
+from jaxdeform._values import read_rigidity
 
 
 def sr_arap(
     mesh: Mesh,
     handles: ArrayLike,
     targets: ArrayLike,
-    alpha: float = 0.02,
+    alpha: ArrayLike = 0.02,
     *,
     weights: ArrayLike | None = None,
     start: ArrayLike | None = None,
@@ -45,12 +47,12 @@ def sr_arap(
     """Deform as rigidly as possible with rotations that vary smoothly, once.
 
     Levi and Gotsman, "Smooth rotation enhanced as-rigid-as-possible mesh animation" (2015). To the
-    energy of `arap` it adds
-    ``alpha sum_{edges ij} b_ij |R_i - R_j|_F^2`` with ``b_ij = area (1 / n_i + 1 / n_j) / 2``:
-    area is that of the mesh, n_i the number of neighbours of vertex i. Where all vertices have the
-    same number of neighbours, alpha is that of CGAL. (CGAL gives vertex i the weight ``1 / n_i``
-    alone, so that its steps are no descent of an energy. On the cactus, whose vertices differ, the
-    ends at 0.02 lie 8e-5 of the diagonal apart, those at 0 4e-8, with the edge weights of CGAL.)
+    energy of `arap` it adds ``sum_{edges ij} (alpha_i + alpha_j) / 2 b_ij |R_i - R_j|_F^2`` with
+    ``b_ij = area (1 / n_i + 1 / n_j) / 2``: area is that of the mesh, n_i the number of neighbours
+    of vertex i. Where all vertices have the same number of neighbours, alpha is that of CGAL. (CGAL
+    gives vertex i the weight ``1 / n_i`` alone, so that its steps are no descent of an energy. On
+    the cactus, whose vertices differ, the ends at 0.02 lie 8e-5 of the diagonal apart, those at 0
+    4e-8, with the edge weights of CGAL.)
 
     Local and global steps alternate, and no step raises the energy. Unlike `arap`, it does not
     look whether the end is a saddle.
@@ -65,7 +67,8 @@ def sr_arap(
     - mesh: the rest shape.
     - handles: (handles,) vertex indices, a mask or a selection.
     - targets: (handles, 3), in the unit of the mesh.
-    - alpha: 0 or more, without unit. 0 is ARAP; the larger, the more equal are the rotations.
+    - alpha: a number or one per vertex (vertices,), 0 or more, without unit. 0 is ARAP; the larger,
+      the more equal are the rotations of neighbours.
     - weights: (edges,), as in `spokes`; by default cotangent weights, where negative ones count
       as 0.
     - start: (vertices, 3), the first guess; by default Laplacian editing.
@@ -89,7 +92,8 @@ def sr_arap(
         (722, 3)
     """
     check_type("mesh", mesh, Mesh)
-    alpha = check_tolerance("alpha", alpha)
+    alpha = read_host_array(alpha, np.float64, "alpha")
+    alpha = np.asarray(read_rigidity(alpha, mesh.n_vertices, alpha.dtype, name="alpha"))
     tolerance = check_tolerance("tolerance", tolerance)
     max_steps = check_count("max_steps", max_steps)
     check_flag("throw", throw)

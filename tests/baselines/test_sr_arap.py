@@ -41,21 +41,23 @@ def couplings():
 def brute_energy(alpha, vertices, rotations):
     """Return the energy of the docstring as a loop over edges, and its second term."""
     first = second = 0.0
+    alpha = np.broadcast_to(alpha, MESH.n_vertices)
     for w, b, (i, j) in zip(WEIGHTS, couplings(), MESH.edges, strict=True):
         rest, now = MESH.vertices[i] - MESH.vertices[j], vertices[i] - vertices[j]
         first += w * sum(np.sum((now - rotations[k] @ rest) ** 2) for k in (i, j))
-        second += alpha * b * np.sum((rotations[i] - rotations[j]) ** 2)
+        second += (alpha[i] + alpha[j]) / 2 * b * np.sum((rotations[i] - rotations[j]) ** 2)
     return first + second, second
 
 
 def brute_step(alpha, vertices, last):
     """Return the rotations of one local step, and the vertices of the global step after it."""
     n = MESH.n_vertices
+    alpha = np.broadcast_to(alpha, n)
     fit, matrix, right = np.zeros((n, 3, 3)), np.zeros((n, n)), np.zeros((n, 3))
     for w, b, (i, j) in zip(WEIGHTS, couplings(), MESH.edges, strict=True):
         pair = np.outer(vertices[i] - vertices[j], MESH.vertices[i] - MESH.vertices[j])
         for k in (i, j):
-            fit[k] += w * pair + alpha * b * (last[i] + last[j])
+            fit[k] += w * pair + (alpha[i] + alpha[j]) / 2 * b * (last[i] + last[j])
     u, _, vt = np.linalg.svd(fit)
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     rotations = u @ vt
@@ -72,8 +74,9 @@ def brute_step(alpha, vertices, last):
     return rotations, moved
 
 
-def test_steps_are_those_of_loops():
-    alpha, start = 0.3, MESH.vertices.copy()
+@pytest.mark.parametrize("alpha", [0.3, np.linspace(0.0, 2.0, MESH.n_vertices)])
+def test_steps_are_those_of_loops(alpha):
+    start = MESH.vertices.copy()
     start[HANDLES] = TARGETS
     vertices, rotations = start, np.zeros((MESH.n_vertices, 3, 3))
     energies = []
@@ -241,8 +244,23 @@ def test_what_happened_is_said():
 def test_misuse_is_named():
     with pytest.raises(jd.InputError, match="alpha is -1"):
         small_sr_arap(TARGETS, -1.0)
+    with pytest.raises(jd.InputError, match=r"alpha is -2.0 at vertex 3"):
+        small_sr_arap(TARGETS, np.where(np.arange(MESH.n_vertices) == 3, -2.0, 1.0))
     with pytest.raises(jd.InputError, match="steps is 0"):
         small_sr_arap(TARGETS, steps=0)
+
+
+def test_alpha_at_some_vertices_holds_the_rotations_together_there(bar, bar_problem):
+    """In the upper half of a bent bar; and a number is the same as that number everywhere."""
+    handles, targets = bar_problem.handles, turned(bar, bar_problem)
+    upper = bar.vertices[:, 1] > 75
+    out = jd.sr_arap(bar, handles, targets, np.where(upper, 1.0, 0.0), steps=300)
+    i, j = bar.edges.T
+    apart = np.linalg.norm(out.transforms[i] - out.transforms[j], axis=(1, 2))
+    both, none = upper[i] & upper[j], ~upper[i] & ~upper[j]
+    assert apart[both].mean() < 0.5 * apart[none].mean()
+    one, many = (small_sr_arap(TARGETS, x) for x in (0.3, np.full(MESH.n_vertices, 0.3)))
+    np.testing.assert_array_equal(one.vertices, many.vertices)
 
 
 # ---------------------------------------------------------------- CGAL
