@@ -38,8 +38,8 @@ class Result(eqx.Enumeration):
     )
     bad_input = (
         "Not solved: a target, weight or rest position is not finite, a rigidity or weight is "
-        "negative, a weight exceeds that of `precompute`, or the rest shape is not the problem's "
-        "own. Outside jit, `deform` raises for the same arguments and names the entry."
+        "negative, a weight exceeds that of `precompute`, or the rest shape, the edge weights or "
+        "the arrays are not those of the problem. Outside jit, `deform` names the entry."
     )
     out_of_proportion = (
         "Not to be trusted: the energy is negative, or vertices lie more than ten diagonals from "

@@ -23,7 +23,9 @@ def read_positions(
     """Like `read_jax_positions`, but without moving NumPy arrays to the device."""
     array = read_array(value, dtype, name)
     if array.shape != shape:
-        raise InputError(f"{name} have shape {array.shape}, expected {shape}: one row per {unit}")
+        raise InputError(
+            f"{name} {have(name)} shape {array.shape}, expected {shape}: one row per {unit}"
+        )
     if is_concrete(array):
         finite = np.isfinite(np.asarray(array)).all(axis=tuple(range(1, array.ndim)))
         bad = np.flatnonzero(~finite)
@@ -78,7 +80,7 @@ def read_axis(name: str, axis: str | ArrayLike) -> Float[np.ndarray, "3"]:
     return vector / np.linalg.norm(vector)
 
 
-def read_one_per_handle(weights: Any, shape: tuple[int, ...]) -> Any:
+def check_one_per_handle(weights: Any, shape: tuple[int, ...]) -> Any:
     """Return the weights, or raise InputError: not one number, nor as many as there are handles."""
     if weights.shape not in ((), shape):
         raise InputError(
@@ -90,7 +92,7 @@ def read_one_per_handle(weights: Any, shape: tuple[int, ...]) -> Any:
 def read_handle_weights(weights: ArrayLike, index: np.ndarray) -> np.ndarray:
     """Return one weight per handle, infinite for a hard handle, or raise InputError."""
     given = read_host_array(weights, np.float64, "handle_weights")
-    given = np.broadcast_to(read_one_per_handle(given, index.shape), index.shape)
+    given = np.broadcast_to(check_one_per_handle(given, index.shape), index.shape)
     bad = np.flatnonzero(~(given >= 0))
     if bad.size:
         raise InputError(

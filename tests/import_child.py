@@ -13,8 +13,6 @@ import threading
 import jax
 import numpy as np
 
-import jaxdeform as jd
-
 
 def state() -> dict[str, object]:
     """Return what all of a process share, but for the filters of warnings: SciPy adds some."""
@@ -40,9 +38,10 @@ def state() -> dict[str, object]:
 
 if __name__ == "__main__":
     before = state()
-    for name in jd.__all__:
-        getattr(jd, name)
-    for module in pkgutil.walk_packages(jd.__path__, "jaxdeform."):
+    package = importlib.import_module("jaxdeform")
+    for name in package.__all__:
+        getattr(package, name)
+    for module in pkgutil.walk_packages(package.__path__, "jaxdeform."):
         importlib.import_module(module.name)
     after = state()
     print(len([name for name in sys.modules if name.startswith("jaxdeform.")]), "modules")

@@ -65,6 +65,7 @@ def set_up(
 def main() -> None:
     """Run the command line. An InputError becomes a line on standard error and exit code 2."""
     with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)  # what is lost is told in any case
         warnings.showwarning = _complain_of
         _run()
 

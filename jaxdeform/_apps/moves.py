@@ -37,10 +37,10 @@ class Motion(NamedTuple):
 
     def turns_in_place(self, points: Float[np.ndarray, "points 3"], size: float) -> bool:
         """Return whether these points lie on the axis of a rotation without a translation."""
-        if self.rotate is None or self.translate or self.about:
+        if self.rotate is None or any(self.translate or ()) or self.about:
             return False
         quarter = self._replace(rotate=(self.rotate[0], 90.0)).of(points)
-        return bool(np.abs(quarter - points).max() <= 1e-12 * size)
+        return bool(np.abs(quarter - points).max() <= 1e-12 * max(size, np.abs(points).max()))
 
     def of(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
         """Return where these points move to: rotated, then translated."""

@@ -107,8 +107,8 @@ def sr_arap(
     else:
         start = guess_at_once(problem.system, inputs.targets)
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
-    how = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
-    out = cut_to_mesh(_solve_at_once(energy, inputs, start, **how), problem.n_vertices)
+    settings = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
+    out = cut_to_mesh(_solve_at_once(energy, inputs, start, **settings), problem.n_vertices)
     return check_result(out, throw)
 
 

@@ -17,8 +17,8 @@ from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._values import (
+    check_one_per_handle,
     read_host_positions,
-    read_one_per_handle,
     read_positions,
     read_rigidity,
 )
@@ -130,7 +130,7 @@ def read_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "v
     if weights is None:
         return system.soft
     given = as_array(weights, problem.dtype, "handle_weights")
-    given = jnp.broadcast_to(read_one_per_handle(given, handles.shape), handles.shape)
+    given = jnp.broadcast_to(check_one_per_handle(given, handles.shape), handles.shape)
     given = jnp.where(system.free[handles], given, 0.0)
     if is_concrete(given, system.soft):
         most = np.asarray(system.soft)[np.asarray(handles)]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.system import System
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, have
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._mesh.cells import Cells
 from jaxdeform._mesh.laplacian import cotangent_weights, opposite_edges
@@ -62,7 +62,7 @@ def read_geometry(
     )
     for name, given, known, unit in own:
         if given.shape != known.shape:
-            raise InputError(f"{name} have shape {given.shape}, expected {known.shape}")
+            raise InputError(f"{name} {have(name)} shape {given.shape}, expected {known.shape}")
         if is_concrete(given):
             size = max(np.abs(known).max(), 1e-300)
             far = ~(np.abs(np.asarray(given) - known) <= 1e3 * np.finfo(dtype).eps * size)

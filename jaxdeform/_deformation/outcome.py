@@ -35,7 +35,8 @@ def outcome_of(system: System, inputs: Inputs, end: Descent) -> Result:
     if inputs.geometry is not None:
         given = inputs.geometry
         for value, own in ((given.rest, system.rest), (given.weights, given.graph.weights)):
-            valid &= jnp.all(jnp.abs(value - own) <= 1e-6 * jnp.max(jnp.abs(own)))
+            near = max(1e-6, 1e3 * float(jnp.finfo(own.dtype).eps))  # as read_geometry has it
+            valid &= jnp.all(jnp.abs(value - own) <= near * jnp.max(jnp.abs(own)))
     result = Result.where(finite & ~proportionate, Result.out_of_proportion, end.result)
     result = Result.where(finite, result, Result.not_finite)
     return Result.where(valid, result, Result.bad_input)

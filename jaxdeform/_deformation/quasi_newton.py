@@ -41,10 +41,10 @@ class QuasiNewton:
       this rigidity. It needs 1/3 to 1/30 of the steps where materials are soft, and its solves take
       2 to 4 times as long. ``"auto"``: the second where a tenth of the cells is softer than a
       constant of 1 (`rigidity_from_material`), on a CPU.
-    - leave_saddles: look for a direction of negative curvature at the end, and go on along it; in
-      a direction of nearly none, go on by a lower tolerance. It costs 4 to 24 products with the
-      Hessian, a quarter of the steps taken. Without it a symmetric deformation may end at a saddle
-      and say 'Converged'.
+    - leave_saddles: look for a direction of negative curvature at the end, and go on along it;
+      where the lowest curvature is nearly 0, go on with a lower tolerance. It costs 4 to 24
+      products with the Hessian, a quarter of the steps taken. Without it a symmetric deformation
+      may end at a saddle and say 'Converged'.
     - can_unroll, needs_one_energy: see `Solver`.
 
     Example:

@@ -130,7 +130,7 @@ def deform(
       (the only one of QuasiNewton).
     - rest: (vertices, 3), the problem's own rest positions, given for derivatives with respect to
       them: the derivative is that of ``precompute`` and ``deform`` together. With ``Implicit()``
-      only.
+      only. First and second derivatives; third ones raise InputError.
     - edge_weights: (edges,), the problem's own edge weights, likewise. Without them the derivative
       to ``rest`` includes that of the cotangent weights.
     - throw: raise an error if the result is not ``ok``, also inside jit. By default numerical

@@ -14,7 +14,7 @@ from jaxdeform._deformation.initial_guess import LaplacianGuess, laplacian_guess
 from jaxdeform._errors import ArrayLike
 from jaxdeform._handles.split import HandleSplit
 from jaxdeform._linalg.buckets import bucket, fill_up, next_of
-from jaxdeform._linalg.cholesky import Factor
+from jaxdeform._linalg.cholesky import Factor, HostCholesky
 from jaxdeform._linalg.ell import EllMatrix
 from jaxdeform._mesh.cells import Cells, principal_moments
 from jaxdeform._mesh.mesh import Mesh, content_digest
@@ -114,12 +114,13 @@ def fingerprint(cells: Cells) -> UInt32[np.ndarray, "2"]:
 def seal_of(system: System, handles: ArrayLike) -> UInt32[np.ndarray, "2"]:
     """Return what tells arrays and handles that were made together from others.
 
-    Of what is read here: the place of every vertex, whether it is free, and which factor it is. (To
-    read the matrices too would take as long as an iteration.)
+    Of what is read here: the place of every vertex, whether it is free, and which factor it is, if
+    that is on the host. (To read the matrices too would take as long as an iteration.)
     """
-    own = system.rest, system.center, system.free, system.soft, system.principal_moments
-    key = getattr(system.factor, "key", system.center)
-    digest = content_digest(np.asarray(handles, np.int64), *map(np.asarray, (*own, key)))
+    own = [system.rest, system.center, system.free, system.soft, system.principal_moments]
+    if isinstance(system.factor, HostCholesky):
+        own.append(system.factor.key)
+    digest = content_digest(np.asarray(handles, np.int64), *map(np.asarray, own))
     return np.frombuffer(digest[:8], np.uint32)
 
 

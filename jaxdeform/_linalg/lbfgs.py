@@ -265,8 +265,7 @@ def _advance(function: Function, system, inputs, settings: LbfgsSettings, tick, 
     last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (inputs, p))
     new = without_fusion(tick >= 0, work.at, partial(function.evaluate, system), *last)
     first = work.iteration == 0
-    # Where even the safe step ends in NaN there is no way on: it is kept, which ends the
-    # member.
+    # Where even the safe step ends in NaN there is no way on: it is kept, which ends the member.
     lost = work.refused & jnp.isnan(new.energy)
     good = (new.energy <= work.at.energy + work.at.rounding) | first | lost
     keep = lambda new, old: jnp.where(jnp.broadcast_to(good, old.shape), new, old)  # noqa: E731

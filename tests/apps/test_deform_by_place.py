@@ -185,9 +185,11 @@ def test_a_rotation_of_what_lies_on_its_axis_is_refused(deform):
     x, y, z = mesh.vertices[300]
     one = f"x>{x - 1e-4} and x<{x + 1e-4} and y>{y - 1e-4} and y<{y + 1e-4}"
     alone = f"{one} and z>{z - 1e-4} and z<{z + 1e-4}"
-    code, _, err = deform("--fix", "y<0.1", "--move", alone, "--rotate", "z", 60)
-    assert code == 2
-    assert "lie on the axis, which goes through their middle, so nothing moves: give --about" in err
+    for chosen in (alone, one):
+        for still in ([], ["--translate", 0, 0, 0]):
+            code, _, err = deform("--fix", "y<0.1", "--move", chosen, "--rotate", "z", 60, *still)
+            assert code == 2
+            assert "lie on the axis, which goes through their middle, so nothing moves" in err
     code, _, err = deform(
         "--fix", "y<0.1", "--move", alone, "--rotate", "z", 60, "--about", 0, 0, 0, "--steps", 2
     )

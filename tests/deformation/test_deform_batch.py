@@ -13,6 +13,7 @@ import pytest
 from helpers import ONE_CPU, one_cpu
 
 import jaxdeform as jd
+from jaxdeform._deformation.batch import MEMORY, _size_of_chunk
 
 CHILD = Path(__file__).with_name("batch_child.py")
 _spec = importlib.util.spec_from_file_location("batch_child", CHILD)
@@ -82,6 +83,14 @@ def test_a_bad_member_does_not_end_the_others(plate, alone):
         np.testing.assert_allclose(out.vertices[k], alone[k].vertices, atol=1e-10)
     with pytest.raises(Exception, match="Not solved"):
         jd.deform_batch(problem, targets, rigidity, memory=SMALL, throw=True)
+
+
+def test_many_members_go_in_two_chunks_and_all_in_as_many_as_fit(plate):
+    problem = plate[0]
+    devices = jax.device_count()
+    assert _size_of_chunk(problem, 191 * devices, MEMORY) == 191 * devices
+    assert _size_of_chunk(problem, 192 * devices, MEMORY) == 96 * devices
+    assert _size_of_chunk(problem, 1000 * devices, SMALL) < 192 * devices
 
 
 def test_what_does_not_fit_together_is_named(plate):

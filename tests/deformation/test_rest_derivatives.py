@@ -150,6 +150,17 @@ def test_another_rest_shape_is_refused_and_said_inside_jit(case):
     assert run(jnp.asarray(problem.cells.weights)) == jd.Result.converged
 
 
+def test_what_is_taken_for_the_problems_own_converges(case):
+    """Inside jit and outside alike, also in float32, where more is rounding."""
+    mesh, handles, targets, *_ = case
+    for dtype, near in ((np.float64, 1e-14), (np.float32, 5e-6)):
+        problem = jd.precompute(mesh, handles, dtype=dtype)
+        weights = np.asarray(problem.cells.weights, dtype)
+        weights = weights + near * weights.max()
+        out = jd.deform(problem, targets, 1.0, edge_weights=weights)
+        assert bool(out.result == jd.Result.converged), dtype
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [jax.jacfwd, jax.grad])
 def test_third_derivatives_to_the_rest_shape_raise(case, first):
