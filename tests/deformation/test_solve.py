@@ -191,7 +191,7 @@ def bad_calls(bar, problem, targets):
             problem, targets, np.where(np.arange(722) == 2, np.nan, 1.0)
         ),
         "rigidity has shape": lambda: jd.deform(problem, targets, [1.0, 2.0]),
-        "start have shape": lambda: jd.deform(problem, targets, 1.0, start=targets),
+        "start has shape": lambda: jd.deform(problem, targets, 1.0, start=targets),
         "steps of Alternating is 0": lambda: jd.deform(
             problem, targets, 1.0, solver=jd.Alternating(0)
         ),
