@@ -123,8 +123,8 @@ def leave_saddles(
 
     def descend_on(way: _Way) -> _Way:
         first = way.descents == 0
-        begin = jnp.where(first, start, way.best.p + way.along)
-        end = descend(begin, settings._replace(tolerance=way.tolerance))
+        place = jnp.where(first, start, way.best.p + way.along)
+        end = descend(place, settings._replace(tolerance=way.tolerance))
         old, new = way.best.energy[way.best.steps], end.energy[end.steps]
         margin = jnp.maximum(settings.tolerance, rounding) * jnp.abs(old)
         lower, higher = first | (new < old - margin), ~first & ~(new <= old + margin)
