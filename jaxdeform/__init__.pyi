@@ -40,6 +40,7 @@ from ._deformation.quasi_newton import QuasiNewton
 from ._deformation.solve import Solution, deform, energy
 from ._deformation.stack import stack_problems
 from ._errors import InputError
+from ._estimation.cell_sizes import RingsEstimate, estimate_rings
 from ._estimation.discrepancy import Discrepancy
 from ._estimation.estimate import Estimate
 from ._estimation.field import FieldEstimate, estimate_rigidity_field
@@ -92,6 +93,7 @@ __all__ = [
     "QuasiNewton",
     "Result",
     "RigidGroup",
+    "RingsEstimate",
     "RotationFit",
     "Selection",
     "Skeleton",
@@ -118,6 +120,7 @@ __all__ = [
     "estimate_rigidity",
     "estimate_rigidity_field",
     "estimate_rigidity_thesis",
+    "estimate_rings",
     "find_handle_groups",
     "find_handles",
     "geodesic_distances",

@@ -27,7 +27,7 @@ WEIGHTS = {"vertices": MESH.vertices, "controls": TWO, "distances": np.ones((N, 
 _NOT_CALLED = (
     "Adjoint Cells CoarseProblem Discrepancy Estimate FieldEstimate HandleFile InputError "
     "Inspection LocalStep Problem Result RigidGroup Selection Skeleton Solution Solver "
-    "ThesisEstimate Turnable Verdict enable_compilation_cache with_derivative_of"
+    "RingsEstimate ThesisEstimate Turnable Verdict enable_compilation_cache with_derivative_of"
 )
 NOT_CALLED = set(_NOT_CALLED.split())
 NO_ARGUMENTS = {"AffineFit", "RotationFit", "Unrolled"}
@@ -193,6 +193,15 @@ def good_calls(folder: Path) -> dict:
             {k: v for k, v in observed.items() if k != "mask"}
             | {"step_size": 0.01, "threshold": 1e-3, "throw": False},
         ),
+        "estimate_rings": (
+            jd.estimate_rings,
+            {
+                k: v
+                for k, v in fit.items()
+                if k in ("problem", "observed", "targets", "mask", "progress")
+            }
+            | {"parts": np.zeros(N, int), "target_noise": 0.0, "most": 1},
+        ),
         "find_handle_groups": (
             jd.find_handle_groups,
             {"mesh": MESH, "deformed": MESH.vertices, "tolerance": 1e-6},
@@ -333,8 +342,8 @@ OF_KIND = {
     "rigidity rotations start targets transforms translations vertices weights",
     "indices": "faces group parts r",
     "vertices": "free handles moved sources",
-    "count": "columns count history_length k memory max_evaluations max_steps n_vertices steps "
-    "width",
+    "count": "columns count history_length k memory max_evaluations max_steps most n_vertices "
+    "steps width",
     "tolerance": "determined_within distance radius seconds smoothness step_size "
     "target_noise threshold tolerance",
     "path": "path motion",

@@ -28,6 +28,21 @@ _HoldOut = Annotated[
         "beside ARAP. Found handles are those of all poses.",
     ),
 ]
+_Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        help="How exactly handles must have moved rigidly to be found, as a fraction of the "
+        "bounding box diagonal. By default four times the noise that is found."
+    ),
+]
+_MostRings = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Estimate the size of the cells too, for each part from 1 to so many rings, by the "
+        "misfit.",
+    ),
+]
 _PictureFile = Annotated[
     Path | None,
     typer.Option(
@@ -55,14 +70,9 @@ def estimate(
             help="Vertices of part 1; given again, of part 2, ... All others are part 0.",
         ),
     ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            help="How exactly handles must have moved rigidly to be found, as a fraction of the "
-            "bounding box diagonal. By default four times the noise that is found."
-        ),
-    ] = None,
+    tolerance: _Tolerance = None,
     rings: Annotated[int, typer.Option(min=1, help="Size of the cells, in rings of vertices.")] = 1,
+    most_rings: _MostRings = None,
     steps: Annotated[
         int | None,
         typer.Option(min=1, help="Number of alternating steps. By default, until convergence."),
@@ -74,6 +84,8 @@ def estimate(
     _check_hold_out(hold_out, len(poses))
     if handles and tolerance is not None:
         raise jd.InputError("--tolerance is for handles that are to be found: leave out --handles")
+    if most_rings and (rings != 1 or steps):
+        raise jd.InputError("--most-rings goes with neither --rings nor --steps: leave these out")
     if picture is not None:
         check_picture_path(picture)
     shape = jd.load_mesh(rest)
@@ -87,8 +99,8 @@ def estimate(
     cells = jd.rings(shape, rings)
     problem = patiently("precomputing", lambda: jd.precompute(shape, index, cells=cells))
     fitted, kept = np.split(observed, [len(poses) - hold_out])
-    fit = _fit(problem, fitted, label, steps)
-    failed = _saved(out, report, shape, fit, as_json(fit, index, found))
+    problem, fit, sizes = _fit(problem, fitted, label, steps, most_rings)
+    failed = _saved(out, report, shape, fit, as_json(fit, index, found, sizes))
     console.print(f"{fit.explain()}\nestimated in {since(began)}")
     if hold_out:
         _report_held_out(problem, kept, poses[-hold_out:], fit.field)
@@ -142,14 +154,34 @@ def _saved(
     return failed
 
 
-def _fit(problem: jd.Problem, observed, label: np.ndarray, steps: int | None) -> jd.Estimate:
+def _fit(
+    problem: jd.Problem, observed, label: np.ndarray, steps: int | None, most_rings: int | None
+) -> tuple[jd.Problem, jd.Estimate, list[int] | None]:
+    """Return the problem that was fitted, the fit, and the sizes of the cells if estimated."""
+    if most_rings:
+        return _fit_rings(problem, observed, label, most_rings)
     solver = jd.QuasiNewton(leave_saddles=False) if steps is None else jd.Alternating(steps)
-    return patiently(
+    fit = patiently(
         "estimating",
         lambda: jd.estimate_rigidity(
             problem, observed, parts=label, solver=solver, progress=_show_evaluation
         ),
     )
+    return problem, fit, None
+
+
+def _fit_rings(
+    problem: jd.Problem, observed, label: np.ndarray, most: int
+) -> tuple[jd.Problem, jd.Estimate, list[int]]:
+    def show(sizes: np.ndarray, misfit: float) -> None:
+        console.print(f"rings {', '.join(map(str, sizes))}: misfit {100 * misfit:.3g} %")
+
+    found = patiently(
+        "estimating",
+        lambda: jd.estimate_rings(problem, observed, parts=label, most=most, progress=show),
+    )
+    console.print(f"rings of the parts: {', '.join(map(str, found.rings))}")
+    return found.problem, found.fit, found.rings.tolist()
 
 
 def _check_hold_out(hold_out: int, count: int) -> None:

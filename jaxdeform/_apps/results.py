@@ -26,11 +26,15 @@ def save_result(
 
 
 def as_json(
-    fit: jd.Estimate, handles: np.ndarray, found: FoundHandles | None = None
+    fit: jd.Estimate,
+    handles: np.ndarray,
+    found: FoundHandles | None = None,
+    rings: list[int] | None = None,
 ) -> dict[str, Any]:
     """Return the content of the report. JSON has no infinity, so null stands for it.
 
-    ``found`` says by which tolerance the handles were found, unless they were given.
+    ``found`` says by which tolerance the handles were found, unless they were given; ``rings``
+    are the sizes of the cells of each part, where they were estimated.
     """
     finite = lambda value: float(value) if np.isfinite(value) else None  # noqa: E731
     return {
@@ -56,4 +60,5 @@ def as_json(
         "result": {"ok": fit.ok, "sentence": jd.Result[fit.result]},
         "handles": handles.tolist(),
         "found": {"tolerance": found.tolerance, "doubt": found.doubt} if found else None,
+        "rings": rings,
     }

@@ -34,6 +34,7 @@ from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.lbfgs import has_converged
 from jaxdeform._linalg.newton import STEP_TOLERANCE, HessianSolver, Step, to_minimum
 from jaxdeform._linalg.rotations import rotation_matrices
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._mesh.mesh import Mesh
 from jaxdeform._mesh.polygons import triangle_area_vectors
 from jaxdeform._result import Result
@@ -93,7 +94,10 @@ class SmoothEnergy(NamedTuple):
 
 
 def _advance(
-    energy: SmoothEnergy, state: Iterate, is_last: Bool[Array, ""], tolerance: float | None
+    energy: SmoothEnergy,
+    state: Iterate,
+    is_last: Bool[Array, ""],
+    tolerance: Float[Array, ""] | None,
 ) -> Iterate:
     """Fit the rotations, and move the vertices unless this is the end."""
     system, p, last = energy.system, state.p, state.transforms
@@ -138,7 +142,7 @@ def unrolled(energy: SmoothEnergy, start: Float[Array, "3 vertices"], steps: int
 
 
 def to_convergence(
-    energy: SmoothEnergy, start: Float[Array, "3 vertices"], tolerance: float, most: int
+    energy: SmoothEnergy, start: Float[Array, "3 vertices"], tolerance: Float[Array, ""], most: int
 ) -> Descent:
     """Iterate until a step gains less than the tolerance."""
 
@@ -149,7 +153,8 @@ def to_convergence(
 
     history = jnp.zeros(most + 1, start.dtype)
     begin = jnp.asarray(0, jnp.int32), Iterate.before(start), history
-    _, end, history = jax.lax.while_loop(lambda carry: ~carry[1].done, body, begin)
+    going = lambda carry: ~carry[1].done  # noqa: E731
+    _, end, history = jax.lax.while_loop(going, body, as_varying(begin))
     result = Result.where(end.steps < most, Result.converged, Result.step_limit)
     return Descent(end.p, end.transforms, history, end.steps, result)
 

@@ -24,6 +24,7 @@ from jaxdeform._deformation.solve import (
     without_derivative,
 )
 from jaxdeform._errors import ArrayLike
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._mesh.cells import spokes
 from jaxdeform._mesh.mesh import Mesh
@@ -107,7 +108,8 @@ def sr_arap(
     else:
         start = guess_at_once(problem.system, inputs.targets)
     energy = SmoothEnergy.build(problem.system, mesh, alpha, problem.dtype)
-    settings = {"tolerance": tolerance, "max_steps": max_steps, "steps": steps}
+    accuracy = np.asarray(tolerance, problem.dtype)
+    settings = {"tolerance": accuracy, "max_steps": max_steps, "steps": steps}
     out = cut_to_mesh(_solve_at_once(energy, inputs, start, **settings), problem.n_vertices)
     return check_result(out, throw)
 
@@ -117,11 +119,12 @@ def _solve(
     inputs: Inputs,
     start: Float[Array, "3 vertices"] | Float[np.ndarray, "3 vertices"],
     *,
-    tolerance: float,
+    tolerance: Float[Array, ""],
     max_steps: int,
     steps: int | None,
 ) -> Solution:
     energy = energy._replace(system=without_derivative(energy.system))
+    energy, inputs, start = as_varying((energy, inputs, start))
     system, targets = energy.system, inputs.targets
     start = jnp.where(system.free[None], start, targets)
     if steps is None:
@@ -136,4 +139,4 @@ def _solve(
     return solution_of(system, inputs, end, value)
 
 
-_solve_at_once = quick_jit(static=("tolerance", "max_steps", "steps"), options=AS_FAST)(_solve)
+_solve_at_once = quick_jit(static=("max_steps", "steps"), options=AS_FAST)(_solve)

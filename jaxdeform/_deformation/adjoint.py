@@ -79,6 +79,7 @@ class Implicit:
     - max_steps: most steps of conjugate gradients.
     - throw: raise an error, also inside jit, instead of returning NaN.
     - needs_one_energy: see `Adjoint`.
+    - numbers: the fields whose change compiles nothing anew.
 
     Example:
         >>> import jaxdeform as jd
@@ -91,6 +92,7 @@ class Implicit:
     throw: bool = False
 
     needs_one_energy: ClassVar[bool] = True
+    numbers: ClassVar[dict[str, type]] = {"tolerance": float, "max_steps": int}
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -128,18 +130,20 @@ class Implicit:
         """
 
         @jax.custom_jvp
-        def minimiser(system, inputs, p, transforms):
-            del system, inputs
+        def minimiser(system, inputs, p, transforms, tolerance, max_steps):
+            del system, inputs, tolerance, max_steps
             return p, Anchor(p, transforms)
 
         @minimiser.defjvp
         def minimiser_jvp(primals, tangents):
-            system, inputs, state, _ = primals
+            system, inputs, state, _, tolerance, max_steps = primals
             known, _ = minimiser(*primals)  # so that this rule has derivatives too
             metric = metric_of(system, energy.local, inputs.rigidity)
             precondition = lambda x: apply_metric(system, metric, x) + system.at_fixed(x)  # noqa: E731
-            (p, transforms), found = self._to_minimum(energy, system, inputs, precondition, state)
-            solver = HessianSolver(precondition, found, self.tolerance, self.max_steps, self.throw)
+            (p, transforms), found = _to_minimum(
+                energy, system, inputs, precondition, state, max_steps
+            )
+            solver = HessianSolver(precondition, found, tolerance, max_steps, self.throw)
             p = p + known - jax.lax.stop_gradient(known)
 
             def gradient(free, inputs):
@@ -160,34 +164,35 @@ class Implicit:
             moves = move, Anchor(move, jnp.zeros_like(transforms))
             return (p, Anchor(p, transforms)), moves
 
-        return minimiser(system, inputs, p, transforms)
+        return minimiser(system, inputs, p, transforms, self.tolerance, self.max_steps)
 
-    def _to_minimum(self, energy: ReducedEnergy, system, inputs, precondition, p):
-        """Return the minimum next to p, the transformations there, and whether it was found.
 
-        By Newton's method. The transformations follow its last step to first order.
-        """
-        known = inputs._replace(geometry=None)
-        system, inputs, p = jax.lax.stop_gradient((system, known, p))
+def _to_minimum(energy: ReducedEnergy, system, inputs, precondition, p, max_steps):
+    """Return the minimum next to p, the transformations there, and whether it was found.
 
-        def evaluate(x):
-            at = energy.evaluate(system, inputs, x)
-            return (at.gradient, at.transforms), at
+    By Newton's method. The transformations follow its last step to first order.
+    """
+    known = inputs._replace(geometry=None)
+    system, inputs, p = jax.lax.stop_gradient((system, known, p))
 
-        def step(state):
-            p, _ = state
-            (gradient, transforms), linear, at = jax.linearize(evaluate, p, has_aux=True)
-            move, left = conjugate_gradients(
-                lambda x: linear(x)[0] + system.at_fixed(x),
-                precondition,
-                -gradient,
-                STEP_TOLERANCE,
-                self.max_steps,
-            )
-            moved = p + move, transforms + linear(move)[1]
-            return Step(moved, left, -dot(gradient, move), at.energy, at.rounding)
+    def evaluate(x):
+        at = energy.evaluate(system, inputs, x)
+        return (at.gradient, at.transforms), at
 
-        return to_minimum(step, (p, jnp.zeros((3, *p.shape), p.dtype)))
+    def step(state):
+        p, _ = state
+        (gradient, transforms), linear, at = jax.linearize(evaluate, p, has_aux=True)
+        move, left = conjugate_gradients(
+            lambda x: linear(x)[0] + system.at_fixed(x),
+            precondition,
+            -gradient,
+            STEP_TOLERANCE,
+            max_steps,
+        )
+        moved = p + move, transforms + linear(move)[1]
+        return Step(moved, left, -dot(gradient, move), at.energy, at.rounding)
+
+    return to_minimum(step, (p, jnp.zeros((3, *p.shape), p.dtype)))
 
 
 def _slope_and_hessian(system: System, gradient, p):

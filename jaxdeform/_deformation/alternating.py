@@ -29,6 +29,7 @@ class Alternating:
     - tolerance: stop early once a step is expected to lower the energy by less than this fraction
       of it.
     - can_unroll, needs_one_energy: see `Solver`.
+    - numbers: the fields whose change compiles nothing anew.
 
     Example:
         >>> import jaxdeform as jd
@@ -41,6 +42,7 @@ class Alternating:
 
     can_unroll: ClassVar[bool] = True
     needs_one_energy: ClassVar[bool] = False
+    numbers: ClassVar[dict[str, type]] = {"tolerance": float}
 
     def __post_init__(self) -> None:
         """Check the settings."""

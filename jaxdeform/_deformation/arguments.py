@@ -11,6 +11,7 @@ from jaxdeform._checks import check_flag
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
 from jaxdeform._deformation.local_step_check import check_local_step
+from jaxdeform._deformation.numbers import Numbers, numbers_of, with_numbers, without_numbers
 from jaxdeform._deformation.problem import Problem, fits_cells
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
@@ -30,6 +31,19 @@ class DeformSettings(NamedTuple):
     energy: ReducedEnergy
     solver: Solver
     adjoint: Adjoint
+
+    def apart(self, dtype: np.dtype) -> tuple[tuple[Numbers, Numbers], "DeformSettings"]:
+        """Return the numbers of solver and adjoint, and the settings without them."""
+        numbers = numbers_of(self.solver, dtype), numbers_of(self.adjoint, dtype)
+        solver = without_numbers(self.solver, numbers[0])
+        return numbers, DeformSettings(
+            self.energy, solver, without_numbers(self.adjoint, numbers[1])
+        )
+
+    def together(self, numbers: tuple[Numbers, Numbers]) -> "DeformSettings":
+        """Return the settings with these numbers."""
+        solver = with_numbers(self.solver, numbers[0])
+        return DeformSettings(self.energy, solver, with_numbers(self.adjoint, numbers[1]))
 
 
 def read_settings(

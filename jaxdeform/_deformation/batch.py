@@ -228,12 +228,14 @@ def _chunks(
     problem: Problem, batch: _Batch, soft: Any, settings: DeformSettings, length: int
 ) -> Iterator[tuple[slice, Solution]]:
     devices = jax.make_mesh((jax.device_count(),), ("batch",), axis_types=(AxisType.Auto,))
-    system, soft = _everywhere(devices, PartitionSpec(), (problem.system, soft))
+    numbers, settings = settings.apart(problem.dtype)
+    whole = problem.system, soft, numbers
+    system, soft, numbers = _everywhere(devices, PartitionSpec(), whole)
     waiting: list[tuple[int, Solution]] = []
     for first in range(0, batch.size, length):
         own = _read_chunk(problem, batch, slice(first, first + length))
         own = _everywhere(devices, PartitionSpec("batch"), own)
-        waiting.append((first, _solve_chunk(system, soft, own, settings, devices)))
+        waiting.append((first, _solve_chunk(system, soft, own, numbers, settings, devices)))
         if len(waiting) == _IN_FLIGHT:
             yield _finished(waiting.pop(0), batch.size, problem.n_vertices)
     for chunk in waiting:
@@ -275,20 +277,23 @@ def _solve_chunk(
     system: System,
     soft: Any,
     own: tuple[Any, ...],
+    numbers: Any,
     settings: DeformSettings,
     devices: jax.sharding.Mesh,
 ) -> Solution:
-    def some(system, soft, own):
+    def some(system, soft, numbers, own):
+        known = settings.together(numbers)
+
         def one(own):
             targets, rigidity, start = own
-            return solve(system, Inputs(targets, rigidity, soft), start, settings)
+            return solve(system, Inputs(targets, rigidity, soft), start, known)
 
         return jax.vmap(one)(own)
 
     whole, part = PartitionSpec(), PartitionSpec("batch")
-    return jax.shard_map(
-        some, mesh=devices, in_specs=(whole, whole, part), out_specs=part, check_vma=False
-    )(system, soft, own)
+    places = whole, whole, whole, part
+    run = jax.shard_map(some, mesh=devices, in_specs=places, out_specs=part)
+    return run(system, soft, numbers, own)
 
 
 def _finished(chunk: tuple[int, Solution], size: int, count: int) -> tuple[slice, Solution]:

@@ -18,6 +18,7 @@ from jaxdeform._linalg.small_matrices import (
     where,
 )
 from jaxdeform._linalg.subset import SMALL, on_few
+from jaxdeform._linalg.varying import as_varying
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -69,7 +70,8 @@ def _diagonal_start(m: Grid, b: list[Array], lam: Scalars) -> Grid:
 
     x = identity(lam)
     # Without a loop, the compiler would repeat these steps for each of the six entries below.
-    for i, y in enumerate(jax.lax.fori_loop(0, 3, newton, [x[i][i] for i in range(3)])):
+    begin = as_varying([x[i][i] for i in range(3)], m, b, lam)
+    for i, y in enumerate(jax.lax.fori_loop(0, 3, newton, begin)):
         x[i][i] = y
     for i, j in _PAIRS:
         both = 2.0 * lam * (x[i][i] ** 2 + x[j][j] ** 2 - 1.0)
@@ -115,7 +117,7 @@ def _block_steps(
 
     begin = (0, x, jnp.full_like(lam, jnp.inf), jnp.ones_like(lam, bool))
     unfinished = lambda s: (jnp.sum(s[3]) > leave) & (s[0] < 30)  # noqa: E731
-    x = jax.lax.while_loop(unfinished, advance, begin)[1]
+    x = jax.lax.while_loop(unfinished, advance, as_varying(begin))[1]
     return x, ~(_norm(half_gradient(x, m, b, lam)) <= tolerance)
 
 
@@ -177,4 +179,4 @@ def _newton_cell(max_steps: int, x, m, b, lam, tolerance) -> Float[Array, "3 3"]
     here, fresh = cell_energy(x, m, b, lam), jnp.sum(b) - 2.0 * jnp.trace(m)
     x = jnp.where(here <= fresh, x, identity)
     state = (0, x, jnp.minimum(here, fresh), jnp.zeros_like(lam))
-    return jax.lax.while_loop(unsolved, advance, state)[1]
+    return jax.lax.while_loop(unsolved, advance, as_varying(state))[1]

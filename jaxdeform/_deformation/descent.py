@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._checks import check_setting
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._result import Result
 
 
@@ -37,7 +38,8 @@ class Iterate(NamedTuple):
         """Return the state before the first evaluation."""
         transforms = jnp.zeros((3, *start.shape), start.dtype)
         zero = jnp.zeros((), start.dtype)
-        return Iterate(start, transforms, zero, jnp.asarray(False), jnp.asarray(0, jnp.int32))
+        no, none = jnp.asarray(False), jnp.asarray(0, jnp.int32)
+        return as_varying(Iterate(start, transforms, zero, no, none))
 
 
 class Anchor(NamedTuple):

@@ -27,6 +27,7 @@ from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.cell_energy import cell_energies, cell_energy
 from jaxdeform._deformation.cell_newton import block_newton, exact_newton, gradient_tolerance
 from jaxdeform._deformation.material_derivative import material_with_derivative
+from jaxdeform._linalg.batching import side_by_side, spread_over_members
 from jaxdeform._linalg.rotations import (
     polar_rotation,
     polar_rotation_of_grid,
@@ -91,16 +92,16 @@ def _over_batch(local: LocalStep):
     """
     minimize = custom_vmap(local.minimize)
 
+    def minimize_all(_, own):
+        members, cells = own[0].shape[0], own[0].shape[-1]
+        flat = [jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], cells * members) for x in own]
+        return jnp.moveaxis(minimize(*flat).reshape(3, 3, cells, members), -1, 0)
+
     @minimize.def_vmap
     def rule(size, is_batched, *data):
-        cells = data[0].shape[-1]
-
-        def flatten(x, batched):
-            x = x if batched else jnp.broadcast_to(x, (size, *x.shape))
-            return jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], cells * size)
-
-        flat = [flatten(x, batched) for x, batched in zip(data, is_batched, strict=True)]
-        return jnp.moveaxis(minimize(*flat).reshape(3, 3, cells, size), -1, 0), True
+        return side_by_side(
+            minimize_all, (), spread_over_members(size, tuple(is_batched), data)
+        ), True
 
     return minimize
 

@@ -24,6 +24,7 @@ from jaxdeform._deformation.reduced_energy import Inputs
 from jaxdeform._deformation.solve import Solution, cut_to_mesh, descend, guess, without_derivative
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, check_result
@@ -97,14 +98,14 @@ def deform_path(
     shape = system.rest if start is None else read_vertices(problem, "start", start)
     last = _Last.of(shape)
     if progress is None:
-        _, out = _follow(system, inputs, last, settings)
+        _, out = _follow(system, inputs, last, *settings.apart(problem.dtype))
     else:
         if not is_concrete(system, inputs, last):
             raise InputError(
                 "progress is told while the frames are computed, not while JAX traces (jit, vmap, "
                 "grad): leave it out there"
             )
-        out = _follow_slowly(system, inputs, last, settings, progress)
+        out = _follow_slowly(system, inputs, last, settings.apart(problem.dtype), progress)
     out = cut_to_mesh(out, problem.n_vertices)
     return check_result(out, throw)
 
@@ -175,11 +176,11 @@ _UNSOUND = Result.not_finite, Result.out_of_proportion, Result.bad_input
 
 @quick_jit(static=("settings",), options=AS_FAST)
 def _follow(
-    system: System, inputs: Inputs, last: _Last, settings: DeformSettings
+    system: System, inputs: Inputs, last: _Last, numbers: Any, settings: DeformSettings
 ) -> tuple[_Last, Solution]:
     """Run all frames of ``inputs.targets`` (frames, 3, vertices), and return where they end."""
-    system = without_derivative(system)
-    led = system.led[None]
+    system, inputs, last = as_varying((without_derivative(system), inputs, last))
+    led, settings = system.led[None], settings.together(numbers)
 
     def frame(last: _Last, targets: Float[Array, "3 vertices"]):
         first = last.start_of_next(system, jnp.where(led, targets, last.targets))
@@ -194,7 +195,7 @@ def _follow_slowly(
     system: System,
     inputs: Inputs,
     last: _Last,
-    settings: DeformSettings,
+    settings: tuple[Any, DeformSettings],
     progress: Callable[[int, int], Any],
 ) -> Solution:
     """Run the frames one by one, and tell of each."""
@@ -202,7 +203,7 @@ def _follow_slowly(
     done = []
     for k in range(frames):
         one = inputs._replace(targets=inputs.targets[k : k + 1])
-        last, out = wait_for(_follow(system, one, last, settings))
+        last, out = wait_for(_follow(system, one, last, *settings))
         done.append(out)
         progress(k + 1, frames)
     return jax.tree.map(lambda *x: jnp.concatenate(x), *done)

@@ -46,6 +46,7 @@ class QuasiNewton:
       products with the Hessian, a quarter of the steps taken. Without it a symmetric deformation
       may end at a saddle and say 'Converged'.
     - can_unroll, needs_one_energy: see `Solver`.
+    - numbers: the fields whose change compiles nothing anew.
 
     Example:
         >>> import jaxdeform as jd
@@ -61,6 +62,7 @@ class QuasiNewton:
 
     can_unroll: ClassVar[bool] = False
     needs_one_energy: ClassVar[bool] = True
+    numbers: ClassVar[dict[str, type]] = {"tolerance": float}
 
     def __post_init__(self) -> None:
         """Check the settings."""

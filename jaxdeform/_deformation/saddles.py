@@ -23,10 +23,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxdeform._deformation.metric import Metric, apply_metric
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
-from jaxdeform._linalg.batching import is_shared, one_by_one, spread_over_members
+from jaxdeform._linalg.batching import is_shared, one_by_one, side_by_side, spread_over_members
 from jaxdeform._linalg.conjugate_gradients import dot
 from jaxdeform._linalg.lanczos import lowest_mode
 from jaxdeform._linalg.lbfgs import LbfgsSettings, Minimum
+from jaxdeform._linalg.varying import as_varying
 
 # Steps of Lanczos where the sign does not show before.
 MOST = 64
@@ -62,8 +63,8 @@ def lowest_curvature(
     Unless ``wanted``, it is 0.
     """
 
-    @custom_vmap
     def look(system, own):
+        system, own = as_varying((system, own))
         inputs, metric, p, transforms, wanted = own
         at = lambda x: energy.evaluate(system, inputs, x, transforms).gradient  # noqa: E731
         gradient, hessian = jax.linearize(at, p)
@@ -74,15 +75,20 @@ def lowest_curvature(
         start = jnp.where(system.free[None], jnp.sin(index * (1.0 + 0.37 * index)), 0.0)
         return Curvature(*lowest_mode(hessian, precondition, start, most, wanted), gain)
 
-    @look.def_vmap
+    def look_at_all(system, own):
+        each, size = partial(look, system), own[-1].shape[0]
+        return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE))
+
+    look_at_one = custom_vmap(look)
+
+    @look_at_one.def_vmap
     def look_at_some(size, is_batched, system, own):
         if not is_shared(is_batched[0]):
-            return one_by_one(look, size, is_batched, (system, own))
+            return one_by_one(look_at_one, size, is_batched, (system, own))
         own = spread_over_members(size, is_batched[1], own)
-        each = partial(look.fun, system)
-        return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE)), Curvature(True, True, True)
+        return side_by_side(look_at_all, system, own), Curvature(True, True, True)
 
-    return look(system, (inputs, metric, p, transforms, jnp.asarray(wanted)))
+    return look_at_one(system, (inputs, metric, p, transforms, jnp.asarray(wanted)))
 
 
 class _Way(NamedTuple):
@@ -151,7 +157,7 @@ def leave_saddles(
         jnp.asarray(settings.tolerance, start.dtype),
     )
     going = lambda way: (way.at_saddle | way.in_valley) & (way.descents < _DESCENTS)  # noqa: E731
-    end = jax.lax.while_loop(going, descend_on, begin)
+    end = jax.lax.while_loop(going, descend_on, as_varying(begin))
     return end.best, end.at_saddle
 
 

@@ -30,6 +30,7 @@ from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError, first_few
 from jaxdeform._linalg.buckets import cut, fill_up
 from jaxdeform._linalg.known_value import with_derivative_of
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import Result, check_result, succeeded
@@ -169,7 +170,9 @@ def deform(
             )
     if start is None:
         start = guess_at_once(problem.system, inputs.targets)
-    out = cut_to_mesh(_solve_at_once(problem.system, inputs, start, settings), problem.n_vertices)
+    numbers, settings = settings.apart(problem.dtype)
+    out = _solve_at_once(problem.system, inputs, start, numbers, settings)
+    out = cut_to_mesh(out, problem.n_vertices)
     return check_result(out, throw)
 
 
@@ -234,7 +237,9 @@ def solve(
     return descend(system, inputs, jnp.asarray(start), settings)[0]
 
 
-_solve_at_once = quick_jit(static=("settings",), options=AS_FAST)(solve)
+@quick_jit(static=("settings",), options=AS_FAST)
+def _solve_at_once(system, inputs, start, numbers, settings):
+    return solve(system, inputs, start, settings.together(numbers))
 
 
 def first_guess(system: System, targets: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
@@ -266,6 +271,7 @@ def descend(
     Return the solution, and its positions relative to the centre of the rest shape.
     """
     energy, solver, adjoint = settings
+    system, inputs, start = as_varying((system, inputs, start))
     start = jnp.where(system.free[None], start, inputs.targets)
     end, anchor = adjoint.solve(solver, energy, system, inputs, start)
     p = end.positions

@@ -121,6 +121,18 @@ def estimate_rigidity(
     return check_result(_judge(found, poses.counted, max(determined_within, 1.0)), throw)
 
 
+def least_squares(model: PartModel, theta: np.ndarray, limit: int = 50) -> Fit:
+    """Return the fit of least misfit alone: no outliers, no noise of the handles, no intervals."""
+    search = _Search(model, 0.0, limit, None)
+    return search.descend(search.evaluate(theta, HandleNoise.none(model.poses)))[0]
+
+
+def is_exact(model: PartModel, fit: Fit) -> bool:
+    """Whether the misfit is no more than what the solver and rounding leave."""
+    misfit, solver_error = map(model.poses.root_mean_square, (fit.residual, fit.solver_error))
+    return bool(misfit <= max(2.0 * solver_error, 10.0 * same_length(model.problem)))
+
+
 class _Found(NamedTuple):
     model: PartModel
     """With the vertices that were kept."""
@@ -143,7 +155,7 @@ class _Search:
     def run(self, theta: np.ndarray) -> _Found:
         """Search from a first guess."""
         exact = HandleNoise.none(self.model.poses)
-        best, result = self._descend(self._evaluate(theta, exact))
+        best, result = self.descend(self.evaluate(theta, exact))
         best, result = self._without_outliers(best, result)
         model, poses = self.model, self.model.poses
         if self.target_noise and succeeded(result):
@@ -156,7 +168,7 @@ class _Search:
                 model.adjoint,
                 self.target_noise,
             )
-            best, result = self._descend(model.weighted(best.theta, best, noise))
+            best, result = self.descend(model.weighted(best.theta, best, noise))
         mesh = model.problem.mesh
         modes = smooth_modes(mesh.vertices, poses.counted, mesh.diagonal)
         jacobian, residual = best.white
@@ -165,21 +177,23 @@ class _Search:
         if wrong and succeeded(result):
             # Then the handles err as smoothly as the rest, and the weights do not hold.
             noise = best.noise.unbounded
-            best, result = self._descend(model.weighted(best.theta, best, noise))
+            best, result = self.descend(model.weighted(best.theta, best, noise))
         return _Found(model, best, modes, p_value, result, self.history)
 
-    def _evaluate(self, theta: np.ndarray, noise: HandleNoise) -> Fit:
+    def evaluate(self, theta: np.ndarray, noise: HandleNoise) -> Fit:
+        """Deform into all poses, and tell of it."""
         fit = self.model.fit(theta, noise)
         self.history.append(self.model.poses.root_mean_square(fit.residual))
         if self.progress is not None:
             self.progress(len(self.history), self.history[-1], np.exp(theta))
         return fit
 
-    def _descend(self, first: Fit):
+    def descend(self, first: Fit):
         """Search on from an evaluation, under its weights."""
-        evaluate = lambda theta: self._evaluate(theta, first.noise)  # noqa: E731
+        evaluate = lambda theta: self.evaluate(theta, first.noise)  # noqa: E731
         left = self.limit - len(self.history)
-        solver = box_solver(*self.model.bounds, self.model.poses.count)
+        low, high = self.model.bounds
+        solver = box_solver(low, high, self.model.poses.count)
         return search(evaluate, first, solver, left)
 
     def _without_outliers(self, best: Fit, result: Result):
@@ -191,7 +205,7 @@ class _Search:
             if not far.any() or not succeeded(result) or len(self.history) >= self.limit:
                 break
             self.model = replace(model, poses=without(model.problem, model.poses, far))
-            best, result = self._descend(self._evaluate(best.theta, best.noise))
+            best, result = self.descend(self.evaluate(best.theta, best.noise))
         return best, result
 
 
@@ -209,8 +223,7 @@ def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
             result = Result.unsettled
     reach = extremes(model, best)
     misfit, solver_error = map(poses.root_mean_square, (best.residual, best.solver_error))
-    explained = misfit <= max(2.0 * solver_error, 10.0 * same_length(problem))
-    p_value = 1.0 if explained else found.p_value
+    p_value = 1.0 if is_exact(model, best) else found.p_value
     discrepancy = describe(
         best.residual, found.modes, poses.count, p_value, diagonal, reach.full_range
     )

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxdeform._linalg.varying import as_varying
+
 # One vector, of any shape.
 Vectors = Float[Array, "..."]
 
@@ -19,8 +21,8 @@ def conjugate_gradients(
     multiply: Callable[[Vectors], Vectors],
     precondition: Callable[[Vectors], Vectors],
     right: Vectors,
-    tolerance: float,
-    max_steps: int,
+    tolerance: float | Float[Array, ""],
+    max_steps: int | Int[Array, ""],
 ) -> tuple[Vectors, Float[Array, ""]]:
     """Return x with H x = right, and the size of its residual relative to that of ``right``.
 
@@ -47,7 +49,7 @@ def conjugate_gradients(
         return (at.square > goal) & (at.steps < max_steps)  # NaN fails the comparison
 
     begin = _State(jnp.zeros((), jnp.int32), jnp.zeros_like(right), right, z, size)
-    end = jax.lax.while_loop(unsolved, step, begin)
+    end = jax.lax.while_loop(unsolved, step, as_varying(begin))
     return end.x, jnp.sqrt(end.square / jnp.where(size > 0, size, 1.0))
 
 

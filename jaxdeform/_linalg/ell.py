@@ -35,6 +35,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
 from jaxdeform._linalg.buckets import next_of
+from jaxdeform._linalg.varying import as_varying
 
 WIDTHS = (8, 12, 16, 20, 24)
 """Slots of a row. One with more entries goes on in overflow rows of half as many slots: a pole of
@@ -181,6 +182,7 @@ def multiply(
     the second. ``transpose`` must hold the same numbers and has no derivatives: those of its
     entries are attributed to ``matrix``.
     """
+    matrix, transpose, x = as_varying((matrix, transpose, x))
     columns_of_blocks = x.shape[-3]
     zeros = jnp.zeros((*x.shape[:-3], matrix.values.shape[0], *x.shape[-2:]), x.dtype)
 

@@ -19,9 +19,12 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
+from jaxdeform._linalg.batching import side_by_side
 from jaxdeform._linalg.ffi import C_FUNCTION, Interface
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._linalg.xla import has_accelerator
 
 _used, _exiting = threading.Event(), threading.Event()
@@ -36,8 +39,8 @@ class HostFunction:
     ) -> None:
         """Register ``function(result, *operands)``, which fills the result, under a name for good.
 
-        Under vmap all arrays get the same number of leading axes. Those of an operand that is the
-        same for all have size 1.
+        Under vmap all arrays get a leading axis. That of an operand that is the same for all has
+        size 1.
         """
         self._name, self._function, self.native = name, function, interface is not None
 
@@ -59,20 +62,38 @@ class HostFunction:
 
     def __call__(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
         """Return the result of a call, traced or not."""
+
+        @custom_vmap
+        def call(*operands):
+            return self._call(result, *operands)
+
+        @call.def_vmap
+        def call_for_all(_size, is_batched, *operands):
+            shared = [x for x, own in zip(operands, is_batched, strict=True) if not own]
+            own = [x for x, own in zip(operands, is_batched, strict=True) if own]
+
+            def call(shared, own):
+                rest, members = iter(shared), iter(own)
+                given = [next(members) if own else next(rest)[None] for own in is_batched]
+                size = own[0].shape[0]
+                return self._call(jax.ShapeDtypeStruct((size, *result.shape), result.dtype), *given)
+
+            return side_by_side(call, shared, own), True
+
+        return call(*operands)
+
+    def _call(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
         if self.native and not has_accelerator():
             _used.set()
-            return jax.ffi.ffi_call(self._name, result, vmap_method="expand_dims")(*operands)
-        rank = operands[0].ndim
+            call = jax.ffi.ffi_call(self._name, result)
+            return as_varying(call(*as_varying(operands)), operands)
 
-        def call(*given):
-            arrays = [np.asarray(x) for x in given]
-            lead = arrays[0].ndim - rank
-            batch = np.broadcast_shapes(*(x.shape[:lead] for x in arrays))
-            out = np.empty((*batch, *result.shape), result.dtype)
-            self._function(out, *arrays)
+        def fill(*given):
+            out = np.empty(result.shape, result.dtype)
+            self._function(out, *(np.asarray(x) for x in given))
             return out
 
-        return jax.pure_callback(call, result, *operands, vmap_method="expand_dims")
+        return jax.pure_callback(fill, result, *operands)
 
 
 @atexit.register

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._linalg.conjugate_gradients import Vectors, dot
+from jaxdeform._linalg.varying import as_varying
 
 
 def lowest_mode(
@@ -63,6 +64,7 @@ def lowest_mode(
 
     at = jnp.zeros((), jnp.int32)
     nothing = _Run(at, begin, none, none, jnp.zeros_like(start), zero, none)
+    at, nothing = as_varying((at, nothing))
 
     def again(carried):
         runs, old = carried

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._linalg.batching import is_shared, one_by_one, spread_over_members
+from jaxdeform._linalg.batching import side_by_side
+from jaxdeform._linalg.varying import as_varying
 from jaxdeform._linalg.xla import after_reads, has_accelerator, without_fusion
 
 # How many members of the batch iterate together. More slots wait longer for each other at the end
@@ -107,22 +107,13 @@ def minimize(
 ) -> Minimum:
     """Minimise from a start. Under vmap over all but the system, run the batch as a queue."""
 
-    @custom_vmap
-    def batch(system, inputs, start, tolerance):
+    def run(system, own):
+        inputs, start, tolerance = own
         return _run_queue(function, system, inputs, start, settings._replace(tolerance=tolerance))
 
-    @batch.def_vmap
-    def larger_batch(size, is_batched, system, *own):
-        if not is_shared(is_batched[0]):
-            return one_by_one(batch, size, is_batched, (system, *own))
-        own = spread_over_members(size, tuple(is_batched[1:]), own)
-        each = own[1].shape[1]
-        flat = jax.tree.map(lambda x: x.reshape(size * each, *x.shape[2:]), own)
-        out = jax.tree.map(lambda x: x.reshape(size, each, *x.shape[1:]), batch(system, *flat))
-        return out, jax.tree.map(lambda _: True, out)
-
     own = inputs, start, jnp.asarray(settings.tolerance, start.dtype)
-    return jax.tree.map(lambda x: x[0], batch(system, *jax.tree.map(lambda x: x[None], own)))
+    out = side_by_side(run, system, jax.tree.map(lambda x: x[None], own))
+    return jax.tree.map(lambda x: x[0], out)
 
 
 class _Memory(NamedTuple):
@@ -213,6 +204,7 @@ def _run_queue(function, system, inputs, start, settings: LbfgsSettings) -> Mini
         return _Queue(tick, member, queue.following + rank[-1], work, out)
 
     begin = _Queue(jnp.zeros((), jnp.int32), member, jnp.asarray(slots, jnp.int32), work, out)
+    begin = as_varying(begin, system, inputs, tolerance)
     return jax.lax.while_loop(lambda q: jnp.any(q.member < count), finish_some, begin).out
 
 

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._linalg.conjugate_gradients import Vectors, conjugate_gradients
+from jaxdeform._linalg.varying import as_varying
 
 STEP_TOLERANCE = 1e-2
 # The last step gains less than this fraction of the energy. The gradient of the bar (bends, twist,
@@ -57,7 +58,7 @@ def to_minimum(take: Callable[[Any], Step], state: Any) -> tuple[Any, Bool[Array
         return ~found & (count < _MOST_STEPS)
 
     begin = jnp.zeros((), jnp.int32), jnp.asarray(False), state
-    _, found, state = jax.lax.while_loop(far, body, begin)
+    _, found, state = jax.lax.while_loop(far, body, as_varying(begin))
     return state, found
 
 
@@ -67,16 +68,16 @@ class HessianSolver(NamedTuple):
     precondition: Callable[[Vectors], Vectors]
     found: Bool[Array, ""]
     """Whether the minimum was found; if not, no derivative there is right."""
-    tolerance: float
+    tolerance: float | Float[Array, ""]
     """Relative residual, but no less than the precision allows."""
-    max_steps: int
+    max_steps: int | Int[Array, ""]
     throw: bool = False
     """Raise an error, also inside jit, instead of returning NaN."""
 
     def solve(self, hessian: Callable[[Vectors], Vectors], right: Vectors) -> Vectors:
         """Return the solution, which has derivatives; NaN where it was not found."""
-        tolerance = max(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
-        accepted = max(100.0 * tolerance, 1e-6)
+        tolerance = jnp.maximum(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
+        accepted = jnp.maximum(100.0 * tolerance, 1e-6)
 
         def solve(multiply, right):
             solution, left = conjugate_gradients(

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jaxdeform._linalg.varying import as_varying
+
 # Up to this many cells, gathering the few would cost more compile time than it saves.
 SMALL = 2000
 
@@ -14,13 +16,14 @@ def on_few(solve, waiting: Bool[Array, "cells"], size: int, x, *data):
     Usually no cell waits, and nothing runs. In all arrays the cells are the last axis.
     """
     n = waiting.shape[0]
+    x, waiting = as_varying((x, waiting), data)
     if size >= n:
         # A loop instead of a cond, because under vmap a cond always runs, for the whole batch.
         put = lambda old, new: jnp.where(waiting, new, old)  # noqa: E731
 
         def once(state):
-            x, _ = state
-            return jax.tree.map(put, x, solve(x, *data)), jnp.zeros((), bool)
+            x, again = state
+            return jax.tree.map(put, x, solve(x, *data)), jnp.zeros_like(again)
 
         return jax.lax.while_loop(lambda state: state[1], once, (x, jnp.any(waiting)))[0]
 

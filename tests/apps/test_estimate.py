@@ -53,6 +53,33 @@ def test_command_predicts_a_pose_that_was_held_out(run, tmp_path, bar, bar_probl
     assert "--hold-out 2 leaves none of the 2 poses" in told
 
 
+@pytest.mark.slow
+def test_command_estimates_the_size_of_the_cells(run, tmp_path, bar, bar_problem):
+    """With wide cells, which it finds, it predicts the twist of a bar of wide cells."""
+    handles = bar_problem.handles
+    points = bar.vertices[handles]
+    wide = jd.precompute(bar, handles, cells=jd.rings(bar, 2))
+    names = [tmp_path / f"{name}.ply" for name in ("rest", "bend", "twist")]
+    jd.save_mesh(names[0], bar)
+    for name, targets in zip(
+        names[1:], (jd.bend(points, 60.0), jd.twist(points, 60.0)), strict=True
+    ):
+        jd.save_mesh(name, bar, vertices=jd.deform(wide, targets, 3.0).vertices)
+    words = "estimate", *names, "--hold-out", 1, "-o", tmp_path / "out.ply", "--most-rings", 2
+    code, shown, _ = run(*words)
+    assert code == 0
+    assert "rings 1: misfit" in shown
+    assert "rings of the parts: 2" in shown
+    report = json.loads((tmp_path / "out.json").read_text())
+    assert report["rings"] == [2]
+    assert report["parts"][0]["rigidity"] == pytest.approx(3.0, rel=1e-3)
+    (line,) = [line for line in shown.splitlines() if "twist.ply" in line]
+    assert float(line.replace("\u2502", " ").split()[1]) < 0.01
+    code, _, told = run(*words, "--steps", 100)
+    assert code == 2
+    assert "--most-rings goes with neither --rings nor --steps" in told
+
+
 def test_command_refuses_what_does_not_fit(run, tmp_path, bar):
     rest, other, out = (tmp_path / name for name in ("rest.ply", "other.ply", "out.ply"))
     jd.save_mesh(rest, bar)

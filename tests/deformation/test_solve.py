@@ -9,6 +9,7 @@ import scipy.sparse.linalg
 from helpers import EXACT, PEER, TWENTY, ends, real_mesh, relative
 
 import jaxdeform as jd
+from benchmarks.harness import compilations
 
 
 def plain_arap(mesh, handles, targets, start, steps):
@@ -89,6 +90,31 @@ def test_other_handles_do_not_recompile(bar, bar_targets, bar_problem):
             start = mesh.vertices + 0.01
             jd.deform(problem, mesh.vertices[handles], shift, solver=TWENTY, start=start)
         assert compiled == []
+
+
+def test_another_tolerance_does_not_recompile(bar_problem, bar_targets):
+    def run(tolerance):
+        rough, fine = jd.QuasiNewton(tolerance), jd.Alternating(500, tolerance=tolerance)
+        adjoint = jd.Implicit(tolerance)
+
+        def height(r):
+            out = jd.deform(bar_problem, bar_targets, r, solver=rough, adjoint=adjoint)
+            return out.vertices[:, 1].mean()
+
+        steps = jd.deform(bar_problem, bar_targets, 1.0, solver=rough).steps
+        fewer = jd.deform(bar_problem, bar_targets, 1.0, solver=fine).steps
+        path = jd.deform_path(bar_problem, bar_targets[None], 1.0, solver=rough).steps[0]
+        return [int(steps), int(fewer), int(path)], float(jax.grad(height)(1.0))
+
+    few, gradient = run(1e-3)
+    with compilations() as compiled:
+        more, close = run(1e-6)
+        other, same = run(1e-3)
+    assert compiled == []
+    assert other == few
+    assert all(a < b for a, b in zip(few, more, strict=True)), (few, more)
+    assert same == gradient
+    np.testing.assert_allclose(gradient, close, rtol=1e-3)
 
 
 def test_results_say_what_happened(bar_problem, bar_targets):
