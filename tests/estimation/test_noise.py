@@ -7,6 +7,7 @@ import pytest
 from helpers import EXACT, FD, THESIS
 
 import jaxdeform as jd
+from jaxdeform._estimation import noise as noise_module
 from jaxdeform._estimation.deformed import State, deform_all
 from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
 from jaxdeform._estimation.poses import Poses
@@ -67,8 +68,12 @@ def test_exact_targets_change_nothing():
 
 
 @pytest.mark.slow
-def test_handle_noise_against_the_dense_covariance():
-    """Four handles have 12 directions, all of which are found."""
+@pytest.mark.parametrize("exact", [False, True])
+def test_handle_noise_against_the_dense_covariance(exact, monkeypatch):
+    """Four handles have 12 directions, all of which are found, as exactly as systems are solved."""
+    if exact:
+        monkeypatch.setattr(noise_module, "_FINDING", 1e-10)
+        monkeypatch.setattr(noise_module, "_MEASURING", 1e-10)
     mesh = jd.shapes.square()
     problem = jd.precompute(mesh, [0, 2, 6, 8])
     targets = np.asarray(jd.twist(mesh.vertices[problem.handles], 60.0, along="y"))
@@ -84,4 +89,6 @@ def test_handle_noise_against_the_dense_covariance():
     for relative in (1.0, 0.5):
         noise = find_handle_noise(problem, poses, field, ends, solver, jd.Implicit(), relative)
         found = (noise.basis[0] * noise.size[0] ** 2) @ noise.basis[0].T
-        np.testing.assert_allclose(found, relative**2 * dense @ dense.T, atol=1e-6)
+        np.testing.assert_allclose(
+            found, relative**2 * dense @ dense.T, atol=1e-6 if exact else 1e-3
+        )
