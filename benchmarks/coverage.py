@@ -3,6 +3,8 @@
 Simulation-based calibration (Talts et al. 2018): each seed draws a truth and the noise, a pose is
 made of them, and the whole nonlinear estimate runs on it. Poses are solved to a tolerance of 1e-12.
 Fits are at their default, whose own error the intervals include; ``--tight`` fits to 1e-11.
+
+``--fields`` does the same for fields: in which share of all vertices does the interval hold?
 """
 
 import argparse
@@ -88,6 +90,74 @@ class Bar:
         return Draw(truth, fit)
 
 
+FIELDS = "wave", "halves"
+"""Rigidity along the bar: a wave of random phase, half as long again as it, or two halves."""
+
+
+class FieldDraw(NamedTuple):
+    """One estimated field beside the truth, at the vertices that are free."""
+
+    truth: np.ndarray
+    rigidity: np.ndarray
+    interval: np.ndarray
+    determined: np.ndarray
+    smoothness: float
+    ok: bool
+
+    @property
+    def covered(self) -> float:
+        """The share of vertices whose interval holds the truth."""
+        low, high = self.interval.T
+        return float(np.mean((low <= self.truth) & (self.truth <= high)))
+
+    @property
+    def error(self) -> float:
+        """The median error of log rigidity."""
+        return float(np.median(np.abs(np.log(self.rigidity / self.truth))))
+
+
+def draw_field(bar: Bar, kind: str, poses: int, noise: float, seed: int) -> FieldDraw:
+    """Draw a field and noisy poses of it, bent by up to 90 degrees, and estimate it."""
+    problem, random = bar.problem, np.random.default_rng(seed)
+    mesh, handles = problem.mesh, problem.handles
+    along = mesh.vertices[:, 1] / np.ptp(mesh.vertices[:, 1])
+    if kind == "wave":
+        wave = np.sin(2 * np.pi * (along / 1.5 + random.uniform()))
+        truth = 10.0 ** (random.uniform(0.0, 1.0) + 0.5 * wave)
+    else:
+        truth = 100.0 ** random.uniform(size=2)[(along > 0.5).astype(int)]
+    rest = mesh.vertices[handles]
+    angles = 90.0 * np.arange(1, poses + 1) / poses
+    targets = np.stack([np.asarray(jd.bend(rest, angle)) for angle in angles])
+    made = [jd.deform(problem, each, truth, solver=EXACT).vertices for each in targets]
+    seen = np.stack(made) + noise * mesh.diagonal * random.standard_normal(
+        (poses, mesh.n_vertices, 3)
+    )
+    fit = jd.estimate_rigidity_field(problem, seen, targets=targets)
+    free = np.setdiff1d(np.arange(mesh.n_vertices), handles)
+    return FieldDraw(
+        truth[free],
+        fit.field[free],
+        fit.interval[free],
+        fit.determined[free],
+        fit.smoothness,
+        fit.ok,
+    )
+
+
+def field_row(kind: str, poses: int, noise: float, draws: list[FieldDraw]) -> str:
+    """Return a row of the table of fields."""
+    covered = 100 * np.array([draw.covered for draw in draws])
+    determined = 100 * np.mean([draw.determined.mean() for draw in draws])
+    return (
+        f"| {kind} | {poses} | {noise:g} | {covered.mean():.1f} ± "
+        f"{covered.std() / np.sqrt(len(draws)):.1f} | {covered.min():.0f} | {determined:.0f} | "
+        f"{np.median([draw.error for draw in draws]):.3f} | "
+        f"{np.median([draw.smoothness for draw in draws]):.1g} | "
+        f"{sum(not draw.ok for draw in draws)} |"
+    )
+
+
 def share(hits: Iterable[bool]) -> str:
     """Return the share of hits in per cent, with its binomial standard error."""
     values = np.array(list(hits), float)
@@ -112,8 +182,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.coverage", description=__doc__)
     parser.add_argument("--seeds", type=int, default=400)
     parser.add_argument("--tight", action="store_true", help="fit to a tolerance of 1e-11")
+    parser.add_argument("--fields", action="store_true", help="fields instead of parts")
     options = parser.parse_args()
     bar = Bar()
+    if options.fields:
+        print(
+            "| field | poses | noise | covered | least | determined | error | smoothness | none |"
+        )
+        print("|---|---|---|---|---|---|---|---|---|")
+        for kind, poses, noise in product(FIELDS, (1, 3), (1e-4, 1e-3)):
+            draws = [draw_field(bar, kind, poses, noise, seed) for seed in range(options.seeds)]
+            print(field_row(kind, poses, noise, draws), flush=True)
+        return
     print(
         f"{bar.problem.mesh.n_vertices} vertices, {options.seeds} seeds a row, shares in per cent"
     )
