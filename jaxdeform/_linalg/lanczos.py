@@ -24,12 +24,12 @@ def lowest_mode(
     H is symmetric, ``precondition`` is M^-1, positive definite. The value is that of x itself,
     ``x^T H x`` with ``x^T M x = 1``: never below the true one, so that a negative value proves that
     H has negative curvature. x is 0 where the value is not negative. It stops once the value is
-    twice as large as its error bound, or after ``most`` steps.
+    larger than its error bound, but not before 12 steps, or after ``most``.
 
     Unless ``wanted``, nothing is done, and the value is 0. (A condition around the call would make
     a batch of all that it reads.)
 
-    The tridiagonal matrix is looked at after 4, 8, 12, 18, 27, 40 and 60 steps.
+    The tridiagonal matrix is looked at after 12, 18, 27, 40 and 60 steps.
 
     The vectors are not kept but made again for x, by a second run, so that memory does not grow
     with the steps. (They lose their orthogonality, which does no harm to the lowest mode.)
@@ -58,7 +58,7 @@ def lowest_mode(
     def is_known(run: "_Run") -> Array:
         beta = run.state.beta
         error = beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
-        sure = ~(2.0 * error >= jnp.abs(run.mu)) & (run.steps > 0)
+        sure = ~(error >= jnp.abs(run.mu)) & (run.steps > 0)
         # Without a way on, or with NaN, it is over before.
         return sure & ((run.steps >= _LEAST) | ~(beta > 0.0)) | (run.steps >= most)
 
@@ -70,7 +70,7 @@ def lowest_mode(
         runs, old = carried
 
         def look(run: "_Run") -> "_Run":
-            soon = jnp.minimum(run.steps + jnp.maximum(_LEAST, run.steps // 2), most)
+            soon = jnp.minimum(jnp.maximum(_LEAST, run.steps + run.steps // 2), most)
             until = jnp.where(runs == 0, soon, old.steps)
             more = lambda run: (run.steps < until) & ((run.state.beta > 0.0) | (run.steps == 0))  # noqa: E731
             run = jax.lax.while_loop(more, partial(step, old.weights), run)
@@ -151,5 +151,8 @@ def _lowest(alphas, betas, steps) -> tuple[Float[Array, ""], Float[Array, "most"
 
 # Shifts at once, and how often: the eigenvalue is known to 1e-13 of the spectrum.
 _SHIFTS, _PASSES = 128, 6
-# The first values say little.
-_LEAST = 4
+# The first values say little. With the bound alone, one of 198 symmetric cases ended at a saddle.
+# Twice the bound and 4 steps found all 53 saddles too, but took 40 steps where nothing was to be
+# found: 0.53 of the deformation on a tube of 5,000 vertices, now 0.23, and on the cactus 0.28, now
+# 0.22.
+_LEAST = 12
