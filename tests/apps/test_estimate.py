@@ -198,7 +198,7 @@ def test_an_estimate_is_told_though_it_cannot_be_written(run, files, bar, monkey
         vertices=bar.vertices[None], misfit=0.0, diagonal=1.0, solver_error=0.0,
         outliers=np.zeros((1, 722), bool), history=np.zeros(2), result=jd.Result.converged,
     )  # fmt: skip
-    monkeypatch.setattr(estimating, "_fit", lambda *_: fit)
+    monkeypatch.setattr(estimating, "_fit", lambda problem, *_: (problem, fit, None))
     writable = [False]
 
     def write(path, content):
