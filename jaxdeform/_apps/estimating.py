@@ -39,6 +39,7 @@ _MostRings = Annotated[
     int | None,
     typer.Option(
         min=1,
+        max=20,
         help="Estimate the size of the cells too, for each part from 1 to so many rings, by the "
         "misfit.",
     ),

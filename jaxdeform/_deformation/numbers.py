@@ -34,6 +34,8 @@ def without_numbers(setting: Setting, numbers: Numbers) -> Setting:
 
 def with_numbers(setting: Setting, numbers: Numbers) -> Setting:
     """Return a setting with these numbers, which may be traced, so that nothing checks them."""
+    if not numbers:
+        return setting  # of another class it may be equal to nothing but itself
     changed = copy.copy(setting)
     for name, value in numbers.items():
         object.__setattr__(changed, name, value)

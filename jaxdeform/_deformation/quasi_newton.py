@@ -42,9 +42,9 @@ class QuasiNewton:
       2 to 4 times as long. ``"auto"``: the second where a tenth of the cells is softer than a
       constant of 1 (`rigidity_from_material`), on a CPU.
     - leave_saddles: look for a direction of negative curvature at the end, and go on along it;
-      where the lowest curvature is nearly 0, go on with a lower tolerance. It costs 12 to 40
-      products with the Hessian, a fifth to a quarter of the deformation. Without it a symmetric
-      one may end at a saddle and say 'Converged'.
+      where the lowest curvature is nearly 0, go on with a lower tolerance. At a minimum it
+      costs 12 to 64 products with the Hessian, mostly a fifth of the deformation. Without it a
+      symmetric deformation may end at a saddle and say 'Converged'.
     - can_unroll, needs_one_energy: see `Solver`.
     - numbers: the fields whose change compiles nothing anew.
 

@@ -4,8 +4,9 @@ Where a mesh, its handles and its targets are symmetric, a descent stays symmetr
 the energy is stationary and lowest among symmetric shapes, although a shape that buckles to one
 side may lie lower: a saddle. The Hessian tells: a saddle has a direction of negative curvature. A
 few steps of Lanczos find it, since it is smooth and far below the other modes. On the bar of 722
-vertices it is, after 8 steps: bent by 90 degrees with rigid cells -0.022 (-0.031 after 48), pushed
-together -0.051 (-0.052); a minimum of rigidity 30 0.079 (0.053), one of rigidity 1 0.37 (0.36).
+vertices the lowest curvature is, after 8 steps: bent by 90 degrees with rigid cells -0.022 (-0.031
+after 48), pushed together -0.051 (-0.052); a minimum of rigidity 30 0.079 (0.053), one of rigidity
+1 0.37 (0.36).
 
 Tried: a start that the metric has smoothed once more. On tubes it took 27 products with the Hessian
 instead of 40, on the bar and the cactus 18 to 40 instead of 12 to 27.

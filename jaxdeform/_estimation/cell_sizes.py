@@ -18,11 +18,14 @@ from jaxdeform._estimation.parts import estimate_rigidity, is_exact, least_squar
 from jaxdeform._estimation.poses import Poses, check_poses
 from jaxdeform._mesh.cells import rings
 from jaxdeform._mesh.selection import check_parts
+from jaxdeform._result import succeeded
 
 # Larger cells than this cover most of a part.
 _MOST = 20
 # Larger cells must lower the misfit by this much, or they are not taken.
 _GAIN = 0.01
+# Searches begin between these materials: beyond them poses hardly change.
+_MATERIALS = 1e-3, 10.0
 # Rounds over the parts, at most.
 _ROUNDS = 3
 
@@ -75,9 +78,11 @@ def estimate_rings(
 
     **Arguments**
 
-    - problem: the rest shape with its handles. The size of its cells is not read, their edge
-      weights are.
-    - observed, parts, targets, target_noise, mask: as in `estimate_rigidity`.
+    - problem: the rest shape with its handles. The size of its cells is not read. Their edge
+      weights are, as `precompute` left them.
+    - observed, parts, targets, target_noise, mask: as in `estimate_rigidity`. Sizes are compared on
+      all vertices that are seen, so mask those that were seen in a wrong place. The noise of the
+      targets is for the last fit.
     - most: the largest size to try, at most 20.
     - progress: called after each combination with its sizes (parts,) and its misfit as a fraction
       of the diagonal.
@@ -104,24 +109,26 @@ def estimate_rings(
     label = check_parts(everywhere if parts is None else parts, problem.mesh)
     search = _Sizes(problem, poses, label, progress)
     best = search.best(most)
-    chosen, known = search.with_sizes(best), search.known
+    chosen, tried = search.with_sizes(best), search.tried
     given: dict[str, Any] = {"targets": targets, "target_noise": target_noise, "mask": mask}
-    fit = estimate_rigidity(chosen, observed, parts=label, start=known[best].rigidity, **given)
+    fit = estimate_rigidity(chosen, observed, parts=label, start=tried[best].rigidity, **given)
     return RingsEstimate(
         rings=np.array(best),
         problem=chosen,
         fit=fit,
-        tried=np.array(list(known)),
-        misfits=np.array([one.misfit for one in known.values()]),
+        tried=np.array(list(tried)),
+        misfits=np.array([one.misfit for one in tried.values()]),
     )
 
 
 class _Sizes:
     """The combinations of sizes, with the least misfit of each."""
 
-    def __init__(self, problem: Problem, poses: Poses, label: Int[np.ndarray, "vertices"], told):
-        self.problem, self.poses, self.label, self.told = problem, poses, label, told
-        self.known: dict[tuple[int, ...], _Tried] = {}
+    def __init__(
+        self, problem: Problem, poses: Poses, label: Int[np.ndarray, "vertices"], progress
+    ):
+        self.problem, self.poses, self.label, self.progress = problem, poses, label, progress
+        self.tried: dict[tuple[int, ...], _Tried] = {}
 
     def best(self, most: int) -> tuple[int, ...]:
         """Return the combination with the least misfit that was found."""
@@ -146,22 +153,24 @@ class _Sizes:
         return large if gained else small
 
     def _try(self, sizes: tuple[int, ...]) -> "_Tried":
-        if sizes not in self.known:
+        if sizes not in self.tried:
             problem = self.with_sizes(sizes)
             solver = QuasiNewton(leave_saddles=False)
             model = PartModel.build(problem, self.poses, self.label, solver, Implicit())
             # A material stays about the same where its cells grow.
-            last = next(reversed(self.known.values()), None)
-            start = None if last is None else last.material * model.size
-            fit = least_squares(model, model.start(start))
+            near = min(self.tried.values(), key=lambda one: one.misfit, default=None)
+            start = None if near is None else np.clip(near.material, *_MATERIALS) * model.size
+            fit, result = least_squares(model, model.start(start))
             misfit = self.poses.root_mean_square(fit.residual) / problem.mesh.diagonal
+            if not succeeded(result):
+                misfit = np.inf
             rigidity = np.exp(fit.theta)
-            self.known[sizes] = _Tried(
+            self.tried[sizes] = _Tried(
                 misfit, is_exact(model, fit), rigidity / model.size, rigidity
             )
-            if self.told is not None:
-                self.told(np.array(sizes), misfit)
-        return self.known[sizes]
+            if self.progress is not None:
+                self.progress(np.array(sizes), misfit)
+        return self.tried[sizes]
 
     def with_sizes(self, sizes: tuple[int, ...]) -> Problem:
         """Return the problem with cells of these sizes."""

@@ -25,7 +25,7 @@ from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
 from jaxdeform._estimation.outliers import find_outliers
 from jaxdeform._estimation.part_model import Fit, PartModel
 from jaxdeform._estimation.poses import check_poses, same_length, without
-from jaxdeform._estimation.search import search
+from jaxdeform._estimation.search import Found, search
 from jaxdeform._estimation.smooth_modes import smooth_modes
 from jaxdeform._estimation.verdict import Verdict
 from jaxdeform._mesh.selection import check_parts
@@ -121,10 +121,10 @@ def estimate_rigidity(
     return check_result(_judge(found, poses.counted, max(determined_within, 1.0)), throw)
 
 
-def least_squares(model: PartModel, theta: np.ndarray, limit: int = 50) -> Fit:
-    """Return the fit of least misfit alone: no outliers, no noise of the handles, no intervals."""
+def least_squares(model: PartModel, theta: np.ndarray, limit: int = 50) -> Found:
+    """Search for the least misfit alone: no outliers, no noise of the handles, no intervals."""
     search = _Search(model, 0.0, limit, None)
-    return search.descend(search.evaluate(theta, HandleNoise.none(model.poses)))[0]
+    return search.descend(search.evaluate(theta, HandleNoise.none(model.poses)))
 
 
 def is_exact(model: PartModel, fit: Fit) -> bool:

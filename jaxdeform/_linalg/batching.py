@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import jax
@@ -9,6 +10,9 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jax.experimental.custom_partitioning import custom_partitioning
 from jax.sharding import NamedSharding, PartitionSpec
+
+from jaxdeform._linalg.ffi import installed_interface
+from jaxdeform._linalg.xla import has_accelerator
 
 
 def is_shared(batched: Any) -> bool:
@@ -43,13 +47,19 @@ def side_by_side(function: Callable[[Any, Any], Any], shared: Any, own: Any) -> 
 
     Under vmap over ``own`` there are only more members. In a program whose members are sharded over
     devices, each device works off its own: XLA by itself would gather whatever goes through a loop
-    or to the host, and do the work of all on every device.
+    or to the host, and do the work of all on every device. It does so where the host is called by
+    ``jax.pure_callback`` (host_call.py), which crashes in a divided program (jax 0.10).
     """
 
     @custom_vmap
     def run(shared, own):
         members = jax.tree.leaves(own)[0].shape[0]
-        return (function if members == 1 else _divided(function, shared))(shared, own)
+        if members == 1 or not _calls_by_address() or has_accelerator():
+            return function(shared, own)
+        try:
+            return _divided(function, shared)(shared, own)
+        except AssertionError:  # JAX divides no function that has captured an array
+            return function(shared, own)
 
     @run.def_vmap
     def run_more(size, is_batched, shared, own):
@@ -63,6 +73,11 @@ def side_by_side(function: Callable[[Any, Any], Any], shared: Any, own: Any) -> 
         return out, jax.tree.map(lambda _: True, out)
 
     return run(shared, own)
+
+
+@cache
+def _calls_by_address() -> bool:
+    return installed_interface() is not None
 
 
 def _divided(function: Callable[[Any, Any], Any], shared: Any) -> Callable[[Any, Any], Any]:

@@ -39,8 +39,8 @@ class HostFunction:
     ) -> None:
         """Register ``function(result, *operands)``, which fills the result, under a name for good.
 
-        Under vmap all arrays get a leading axis. That of an operand that is the same for all has
-        size 1.
+        Under vmap all arrays get the same number of leading axes. Those of an operand that is the
+        same for all have size 1.
         """
         self._name, self._function, self.native = name, function, interface is not None
 
@@ -62,10 +62,14 @@ class HostFunction:
 
     def __call__(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
         """Return the result of a call, traced or not."""
+        if not self.native or has_accelerator():
+            return self._call_back(result, *operands)
+        _used.set()
 
         @custom_vmap
         def call(*operands):
-            return self._call(result, *operands)
+            out = jax.ffi.ffi_call(self._name, result)(*as_varying(operands))
+            return as_varying(out, operands)
 
         @call.def_vmap
         def call_for_all(_size, is_batched, *operands):
@@ -75,25 +79,25 @@ class HostFunction:
             def call(shared, own):
                 rest, members = iter(shared), iter(own)
                 given = [next(members) if own else next(rest)[None] for own in is_batched]
-                size = own[0].shape[0]
-                return self._call(jax.ShapeDtypeStruct((size, *result.shape), result.dtype), *given)
+                shape = own[0].shape[0], *result.shape
+                return self(jax.ShapeDtypeStruct(shape, result.dtype), *given)
 
             return side_by_side(call, shared, own), True
 
         return call(*operands)
 
-    def _call(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
-        if self.native and not has_accelerator():
-            _used.set()
-            call = jax.ffi.ffi_call(self._name, result)
-            return as_varying(call(*as_varying(operands)), operands)
+    def _call_back(self, result: jax.ShapeDtypeStruct, *operands: Array) -> Array:
+        rank = operands[0].ndim
 
-        def fill(*given):
-            out = np.empty(result.shape, result.dtype)
-            self._function(out, *(np.asarray(x) for x in given))
+        def call(*given):
+            arrays = [np.asarray(x) for x in given]
+            lead = arrays[0].ndim - rank
+            batch = np.broadcast_shapes(*(x.shape[:lead] for x in arrays))
+            out = np.empty((*batch, *result.shape), result.dtype)
+            self._function(out, *arrays)
             return out
 
-        return jax.pure_callback(fill, result, *operands)
+        return jax.pure_callback(call, result, *operands, vmap_method="expand_dims")
 
 
 @atexit.register

@@ -29,7 +29,7 @@ def lowest_mode(
     Unless ``wanted``, nothing is done, and the value is 0. (A condition around the call would make
     a batch of all that it reads.)
 
-    The tridiagonal matrix is looked at after 12, 18, 27, 40 and 60 steps.
+    The tridiagonal matrix is looked at after 12, 18, 27, 40, 60 and ``most`` steps.
 
     The vectors are not kept but made again for x, by a second run, so that memory does not grow
     with the steps. (They lose their orthogonality, which does no harm to the lowest mode.)

@@ -78,6 +78,7 @@ class HessianSolver(NamedTuple):
         """Return the solution, which has derivatives; NaN where it was not found."""
         tolerance = jnp.maximum(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
         accepted = jnp.maximum(100.0 * tolerance, 1e-6)
+        accepted = jnp.minimum(accepted, jnp.maximum(1e-2, 2.0 * tolerance))
 
         def solve(multiply, right):
             solution, left = conjugate_gradients(

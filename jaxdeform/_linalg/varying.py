@@ -23,7 +23,7 @@ def as_varying(value: T, *others: Any) -> T:
         return value
 
     def cast(x: Any) -> Any:
-        missing = tuple(axes - _axes(x))
+        missing = tuple(sorted(axes - _axes(x)))
         return jax.lax.pcast(x, missing, to="varying") if missing else x
 
     return jax.tree.map(cast, value)

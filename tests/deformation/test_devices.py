@@ -16,7 +16,7 @@ CHILD = Path(__file__).with_name("devices_child.py")
 @pytest.mark.parametrize(
     ("cpus", "names"),
     [
-        ("all", ["targets", "rigidity", "steps", "gradient", "path", "sr_arap"]),
+        ("all", ["targets", "rigidity", "steps", "gradient", "path", "sr_arap", "callback"]),
         pytest.param("one", ["targets"], marks=ONE_CPU),
     ],
 )

@@ -117,6 +117,22 @@ def test_another_tolerance_does_not_recompile(bar_problem, bar_targets):
     np.testing.assert_allclose(gradient, close, rtol=1e-3)
 
 
+def test_a_solver_that_equals_nothing_but_itself_does_not_recompile(bar_problem, bar_targets):
+    class Own:
+        can_unroll, needs_one_energy = False, True
+        default_adjoint = jd.Implicit()
+
+        def minimize(self, *arguments):
+            return jd.QuasiNewton(max_steps=5).minimize(*arguments)
+
+    solver = Own()
+    first = jd.deform(bar_problem, bar_targets, 1.0, solver=solver)
+    with compilations() as compiled:
+        second = jd.deform(bar_problem, bar_targets, 1.0, solver=solver)
+    assert compiled == []
+    np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
 def test_results_say_what_happened(bar_problem, bar_targets):
     ran = jd.deform(bar_problem, bar_targets, 1.0, solver=jd.Alternating(3))
     assert "number of steps" in str(ran.result)

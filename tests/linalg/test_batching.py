@@ -35,6 +35,15 @@ def test_members_of_nested_vmaps_go_together(jit):
     assert (np.asarray(members) == 6).all()
 
 
+def test_a_function_may_read_an_array_of_its_own():
+    captured = jnp.asarray(VECTOR[0, 0])
+    plus = lambda shared, own: own + shared + captured  # noqa: E731
+    over = jax.vmap(lambda x: side_by_side(plus, 1.0, x[None])[0])
+    expected = VECTOR[0] + 1.0 + VECTOR[0, 0]
+    np.testing.assert_allclose(over(VECTOR[0]), expected, rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(over)(VECTOR[0]), expected, rtol=1e-14)
+
+
 def test_what_is_not_shared_goes_one_by_one():
     """The matrix is that of the outer batch, so only the three of the inner one go together."""
     over = jax.vmap(jax.vmap(one, in_axes=(None, 0, None)), in_axes=(0, 0, None))
