@@ -37,7 +37,7 @@ def test_members_of_nested_vmaps_go_together(jit):
 
 def test_a_function_may_read_an_array_of_its_own():
     captured = jnp.asarray(VECTOR[0, 0])
-    plus = lambda shared, own: own + shared + captured  # noqa: E731
+    plus = lambda shared, own: own + shared + captured[None]  # noqa: E731
     over = jax.vmap(lambda x: side_by_side(plus, 1.0, x[None])[0])
     expected = VECTOR[0] + 1.0 + VECTOR[0, 0]
     np.testing.assert_allclose(over(VECTOR[0]), expected, rtol=1e-14)
