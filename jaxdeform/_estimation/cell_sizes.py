@@ -105,8 +105,7 @@ def estimate_rings(
     check_count("most", most, most=_MOST)
     check_function("progress", progress, "sizes, misfit")
     poses = check_poses(problem, observed, targets, mask)
-    everywhere = np.zeros(problem.n_vertices, int)
-    label = check_parts(everywhere if parts is None else parts, problem.mesh)
+    label = check_parts(parts, problem.mesh)
     search = _Sizes(problem, poses, label, progress)
     best = search.best(most)
     chosen, tried = search.with_sizes(best), search.tried

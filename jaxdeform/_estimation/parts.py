@@ -114,8 +114,7 @@ def estimate_rigidity(
     noise = float(targets is None) if target_noise is None else target_noise
     check_tolerance("target_noise", noise)
     poses = check_poses(problem, observed, targets, mask)
-    everywhere = np.zeros(problem.n_vertices, int)
-    label = check_parts(everywhere if parts is None else parts, problem.mesh)
+    label = check_parts(parts, problem.mesh)
     model = PartModel.build(problem, poses, label, solver, adjoint)
     found = _Search(model, noise, max_evaluations, progress).run(model.start(start))
     return check_result(_judge(found, poses.counted, max(determined_within, 1.0)), throw)

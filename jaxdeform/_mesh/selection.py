@@ -214,8 +214,13 @@ def ranges(mesh: Mesh) -> str:
     return f"x runs {x}, y {y}, z {z}"
 
 
-def check_parts(parts: ArrayLike, mesh: Mesh) -> Int[np.ndarray, "vertices"]:
-    """Return the part of each vertex, or raise InputError naming what is wrong."""
+def check_parts(parts: ArrayLike | None, mesh: Mesh) -> Int[np.ndarray, "vertices"]:
+    """Return the part of each vertex, or raise InputError naming what is wrong.
+
+    Without parts the whole mesh is part 0.
+    """
+    if parts is None:
+        return np.zeros(mesh.n_vertices, np.int32)
     given, n = read_mask_or_numbers("parts", parts, mesh), mesh.n_vertices
     label = given.astype(int) if given.dtype == bool else given
     label = read_labels("parts", label, n, "vertex", n)

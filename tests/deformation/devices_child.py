@@ -1,7 +1,7 @@
 """What test_devices.py runs with several devices: ``devices_child.py FILE NAME...``.
 
 Every function of a member by a loop, by ``shard_map`` as it stands, and by ``vmap`` of input that
-is sharded. Writes the values, and how many devices the last has used for each array.
+is sharded. Writes the values, and whether the last left every member on its device.
 """
 
 import re

@@ -13,6 +13,7 @@ from helpers import EXACT, PEER, THESIS, noisy
 from scipy.optimize import least_squares, lsq_linear
 
 import jaxdeform as jd
+from benchmarks.harness import compilations
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, box_least_squares, box_solver
 from jaxdeform._estimation.search import profile_bound, search
 from jaxdeform._result import succeeded
@@ -166,11 +167,8 @@ def test_a_second_search_compiles_nothing():
         Evaluation(jnp.zeros(3), decay(jnp.zeros(3)), lx.MatrixLinearOperator(jnp.ones((9, 3))))
     )
     solver = box_solver(np.full(3, -1.0), np.full(3, 2.0))
-    compiled = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
-    )
-    search(lambda _: first, first, solver, 3)
+    with compilations() as compiled:
+        search(lambda _: first, first, solver, 3)
     assert compiled == []
 
 

@@ -11,6 +11,7 @@ import scipy.sparse.linalg
 from helpers import EXACT, ends
 
 import jaxdeform as jd
+from benchmarks.harness import compilations
 from jaxdeform._deformation.covariance import stiffness
 from jaxdeform._linalg import cholesky, elimination_tree
 from jaxdeform._linalg.nested_dissection import DissectedFactor, dissected_factor
@@ -226,14 +227,10 @@ def test_an_accelerator_runs_without_the_host(bar, accelerator):
         assert "callback" not in program
         assert "ffi_call" not in program
     prepare(handles, few)(points)
-    compiled = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
-    )
     handles = np.flatnonzero(bar.vertices[:, 1] > 70)
     run = prepare(handles, few)
-    compiled.clear()
-    run(bar.vertices[handles] + 0.1)
+    with compilations() as compiled:
+        run(bar.vertices[handles] + 0.1)
     assert compiled == []
 
 
