@@ -76,15 +76,20 @@ class HessianSolver(NamedTuple):
 
     def solve(self, hessian: Callable[[Vectors], Vectors], right: Vectors) -> Vectors:
         """Return the solution, which has derivatives; NaN where it was not found."""
-        tolerance = jnp.maximum(self.tolerance, 20 * float(jnp.finfo(right.dtype).eps))
+        # All that the system reads is cast here. Transposed, it is cast as a whole, and a cast
+        # within would be a second one.
+        tolerance, max_steps, found = as_varying(
+            (self.tolerance, self.max_steps, self.found), right
+        )
+        tolerance = jnp.maximum(tolerance, 20 * float(jnp.finfo(right.dtype).eps))
         accepted = jnp.maximum(100.0 * tolerance, 1e-6)
         accepted = jnp.minimum(accepted, jnp.maximum(1e-2, 2.0 * tolerance))
 
         def solve(multiply, right):
             solution, left = conjugate_gradients(
-                multiply, self.precondition, right, tolerance, self.max_steps
+                multiply, self.precondition, right, tolerance, max_steps
             )
-            unsolved = ~(self.found & (left <= accepted))
+            unsolved = ~(found & (left <= accepted))
             if self.throw:
                 return eqx.error_if(solution, unsolved, _UNSOLVED)
             return jnp.where(unsolved, jnp.nan, solution)
