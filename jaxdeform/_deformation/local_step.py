@@ -16,18 +16,17 @@ against the alternatives in docs/benchmarks.md.
 """
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 
 from jaxdeform._checks import check_count, check_tolerance
 from jaxdeform._deformation.cell_energy import cell_energies, cell_energy
 from jaxdeform._deformation.cell_newton import block_newton, exact_newton, gradient_tolerance
 from jaxdeform._deformation.material_derivative import material_with_derivative
-from jaxdeform._linalg.batching import side_by_side, spread_over_members
+from jaxdeform._linalg.batching import as_member
 from jaxdeform._linalg.rotations import (
     polar_rotation,
     polar_rotation_of_grid,
@@ -78,32 +77,24 @@ class LocalStep(Protocol):
 
 def solve_local_step(local: LocalStep, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
     """Run a local step. Its iterations are not differentiated; its solution is."""
-    t = _over_batch(local)(*map(jax.lax.stop_gradient, (c, b, rigidity)))
+    t = _minimize(local, *map(jax.lax.stop_gradient, (c, b, rigidity)))
     return local.with_implicit_derivative(t, c, b, rigidity)
 
 
-@cache
-def _over_batch(local: LocalStep):
-    """Return ``local.minimize`` with a vmap of its own: a batch becomes one longer list of cells.
+def _minimize(local: LocalStep, c: Matrices, b: Vectors, rigidity: Scalars) -> Matrices:
+    """Run ``local.minimize``. Under vmap a batch becomes one longer list of cells.
 
     Cells do not know of each other. Under the general rule every member of a batch would run
     whatever any member needs, such as the exact steps of a few cells: 64 bars took 4 times as long
     per bar as one bar alone.
     """
-    minimize = custom_vmap(local.minimize)
 
-    def minimize_all(_, own):
+    def minimize(_, own):
         members, cells = own[0].shape[0], own[0].shape[-1]
         flat = [jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], cells * members) for x in own]
-        return jnp.moveaxis(minimize(*flat).reshape(3, 3, cells, members), -1, 0)
+        return jnp.moveaxis(local.minimize(*flat).reshape(3, 3, cells, members), -1, 0)
 
-    @minimize.def_vmap
-    def rule(size, is_batched, *data):
-        return side_by_side(
-            minimize_all, (), spread_over_members(size, tuple(is_batched), data)
-        ), True
-
-    return minimize
+    return as_member(minimize, (), (c, b, rigidity))
 
 
 class _Material:

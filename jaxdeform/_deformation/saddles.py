@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._deformation.metric import Metric, apply_metric
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
 from jaxdeform._deformation.system import System
-from jaxdeform._linalg.batching import is_shared, one_by_one, side_by_side, spread_over_members
+from jaxdeform._linalg.batching import as_member
 from jaxdeform._linalg.conjugate_gradients import dot
 from jaxdeform._linalg.lanczos import lowest_mode
 from jaxdeform._linalg.lbfgs import LbfgsSettings, Minimum
@@ -78,18 +77,12 @@ def lowest_curvature(
 
     def look_at_all(system, own):
         each, size = partial(look, system), own[-1].shape[0]
+        if size == 1:  # no loop, which would hide what is known when it is compiled
+            out = each(jax.tree.map(lambda x: x[0], own))
+            return jax.tree.map(lambda x: x[None], out)
         return jax.lax.map(each, own, batch_size=min(size, _AT_ONCE))
 
-    look_at_one = custom_vmap(look)
-
-    @look_at_one.def_vmap
-    def look_at_some(size, is_batched, system, own):
-        if not is_shared(is_batched[0]):
-            return one_by_one(look_at_one, size, is_batched, (system, own))
-        own = spread_over_members(size, is_batched[1], own)
-        return side_by_side(look_at_all, system, own), Curvature(True, True, True)
-
-    return look_at_one(system, (inputs, metric, p, transforms, jnp.asarray(wanted)))
+    return as_member(look_at_all, system, (inputs, metric, p, transforms, jnp.asarray(wanted)))
 
 
 class _Way(NamedTuple):

@@ -75,6 +75,15 @@ def side_by_side(function: Callable[[Any, Any], Any], shared: Any, own: Any) -> 
     return run(shared, own)
 
 
+def as_member(function: Callable[[Any, Any], Any], shared: Any, own: Any) -> Any:
+    """Return ``function(shared, own)`` of one member, which has no axis of members.
+
+    Under vmap the function gets all members, by `side_by_side`.
+    """
+    out = side_by_side(function, shared, jax.tree.map(lambda x: x[None], own))
+    return jax.tree.map(lambda x: x[0], out)
+
+
 @cache
 def _calls_by_address() -> bool:
     return installed_interface() is not None

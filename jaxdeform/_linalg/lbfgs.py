@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._linalg.batching import side_by_side
+from jaxdeform._linalg.batching import as_member
 from jaxdeform._linalg.varying import as_varying
 from jaxdeform._linalg.xla import after_reads, has_accelerator, without_fusion
 
@@ -112,8 +112,7 @@ def minimize(
         return _run_queue(function, system, inputs, start, settings._replace(tolerance=tolerance))
 
     own = inputs, start, jnp.asarray(settings.tolerance, start.dtype)
-    out = side_by_side(run, system, jax.tree.map(lambda x: x[None], own))
-    return jax.tree.map(lambda x: x[0], out)
+    return as_member(run, system, own)
 
 
 class _Memory(NamedTuple):
