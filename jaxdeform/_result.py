@@ -5,7 +5,9 @@ from functools import reduce
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxdeform._arrays import is_concrete
@@ -74,11 +76,12 @@ def check_result(out: Any, throw: bool) -> Any:
     """Return an output; with ``throw``, raise the sentence of its result where that is not ok."""
     if not throw:
         return out
-    failed = ~succeeded(out.result)
-    if is_concrete(failed):
-        out.result.error_if(jnp.zeros(()), failed)
-        return out
-    return out.result.error_if(out, failed)  # raised as the program runs
+    if not is_concrete(out.result):
+        return out.result.error_if(out, ~succeeded(out.result))  # raised as the program runs
+    # On one device: of a result that is divided, each device would wait for the others for ever.
+    result = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), out.result)
+    result.error_if(jnp.zeros(()), ~succeeded(result))
+    return out
 
 
 # Equinox does not list the members.

@@ -10,12 +10,13 @@ from jaxdeform._arrays import as_array, is_concrete
 from jaxdeform._checks import check_flag
 from jaxdeform._deformation.alternating import Alternating
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
+from jaxdeform._deformation.geometry import Geometry, geometry_of, graph_of
 from jaxdeform._deformation.local_step_check import check_local_step
 from jaxdeform._deformation.numbers import Numbers, numbers_of, with_numbers, without_numbers
 from jaxdeform._deformation.problem import Problem, fits_cells
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform._errors import ArrayLike, InputError
+from jaxdeform._errors import ArrayLike, InputError, have
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._values import (
     check_one_per_handle,
@@ -155,3 +156,36 @@ def read_weights(problem: Problem, weights: ArrayLike | None) -> Float[Array, "v
                 f"{most[bad[0]]}, the weight that it had in precompute"
             )
     return jnp.zeros_like(system.soft).at[handles].set(given)
+
+
+def read_geometry(
+    problem: Problem, rest: ArrayLike | None, edge_weights: ArrayLike | None
+) -> Geometry:
+    """Return the geometry from the problem's own rest positions and weights, or raise InputError.
+
+    They are given only for derivatives with respect to them. Other values than the problem's are
+    refused.
+    """
+    cells, dtype = problem.own_cells, problem.dtype
+    graph = graph_of(cells, dtype)
+    moved = problem.vertices if rest is None else rest
+    moved = as_array(moved, dtype, "rest")
+    weights = cells.weights if edge_weights is None else edge_weights
+    weights = as_array(weights, dtype, "edge_weights")
+    own = (
+        ("rest", moved, problem.vertices, "vertex"),
+        ("edge_weights", weights, cells.weights, "edge"),
+    )
+    for name, given, known, unit in own:
+        if given.shape != known.shape:
+            raise InputError(f"{name} {have(name)} shape {given.shape}, expected {known.shape}")
+        if is_concrete(given):
+            size = max(np.abs(known).max(), 1e-300)
+            far = ~(np.abs(np.asarray(given) - known) <= 1e3 * np.finfo(dtype).eps * size)
+            if far.any():
+                raise InputError(
+                    f"{name} of {unit} {np.argwhere(far)[0][0]} are not the problem's own: they "
+                    "are given only for derivatives; call precompute for another rest shape"
+                )
+    at = problem.system.rest if rest is None else read_vertices(problem, "rest", rest)
+    return geometry_of(graph, jnp.asarray(at), weights, edge_weights is not None)

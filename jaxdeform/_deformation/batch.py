@@ -22,7 +22,6 @@ from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike, InputError, have
 from jaxdeform._linalg.buckets import fill_up
 from jaxdeform._linalg.lbfgs import SLOTS
-from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._linalg.xla import AS_FAST, quick_jit
 from jaxdeform._result import check_result
 
@@ -95,8 +94,9 @@ def deform_batch(
     """
     check_flag("throw", throw)
     check_function("progress", progress, "members done, members")
-    settings = local, solver, normals, memory
-    total, chunks = _planned(problem, targets, rigidity, start, handle_weights, *settings)
+    total, chunks = _planned(
+        problem, targets, rigidity, start, handle_weights, local, solver, normals, memory
+    )
     done = []
     for members, part in chunks:
         done.append(part)
@@ -140,8 +140,9 @@ def deform_in_chunks(
         >>> bool((heights > 100).all())
         True
     """
-    settings = local, solver, normals, memory
-    return _planned(problem, targets, rigidity, start, handle_weights, *settings)[1]
+    return _planned(
+        problem, targets, rigidity, start, handle_weights, local, solver, normals, memory
+    )[1]
 
 
 def _planned(
@@ -216,7 +217,7 @@ class _Batch(NamedTuple):
 def _size_of_chunk(problem: Problem, size: int, memory: int) -> int:
     """Return how many members a chunk has: all chunks are alike, and compile once."""
     devices = jax.device_count()
-    member = _NUMBERS * problem.n_vertices * problem.dtype.itemsize
+    member = _NUMBERS * problem.bucket * problem.dtype.itemsize
     most = max(1, memory // (member * _IN_FLIGHT)) * devices
     count = -(-size // most)
     if size >= _MANY * devices:
@@ -292,7 +293,9 @@ def _solve_chunk(
 
     whole, part = PartitionSpec(), PartitionSpec("batch")
     places = whole, whole, whole, part
-    run = jax.shard_map(some, mesh=devices, in_specs=places, out_specs=part)
+    # Nothing is summed over devices, so what differs between them need not be followed: the loops
+    # of other local steps (jaxopt's, a user's own) do not.
+    run = jax.shard_map(some, mesh=devices, in_specs=places, out_specs=part, check_vma=False)
     return run(system, soft, numbers, own)
 
 
@@ -305,4 +308,4 @@ def _finished(chunk: tuple[int, Solution], size: int, count: int) -> tuple[slice
         out = jax.tree.map(partial(multihost_utils.process_allgather, tiled=True), out)
     last = min(first + len(out.steps), size)
     out = jax.tree.map(lambda x: jnp.asarray(x[: last - first]), out)
-    return slice(first, last), wait_for(cut_to_mesh(out, count))
+    return slice(first, last), cut_to_mesh(out, count)

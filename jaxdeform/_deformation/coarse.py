@@ -131,7 +131,7 @@ def coarsen(problem: Problem, n_vertices: int = 2000) -> CoarseProblem:
     """
     check_problem(problem)
     n_vertices = check_count("n_vertices", n_vertices, least=4, most=2**31 - 1)
-    mesh, system = problem.mesh, problem.system
+    mesh = problem.mesh
     if not is_concrete(problem):
         raise InputError("problem is traced by JAX: call coarsen outside of jit")
     if n_vertices >= mesh.referenced.sum():
@@ -146,11 +146,9 @@ def coarsen(problem: Problem, n_vertices: int = 2000) -> CoarseProblem:
     handles = np.asarray(problem.handles)[rows]
     near, taken, first = _nearest_handles(_places(mesh, points, component), everywhere[handles])
     points[taken] = mesh.vertices[handles[first]]
-    soft = np.bincount(near, np.asarray(system.soft)[handles], len(points))[taken]
-    hard = np.bincount(near, ~np.asarray(system.free)[handles], len(points))[taken] > 0
-
+    weights = np.bincount(near, problem.handle_weights[rows], len(points))[taken]
     coarse = Mesh(points, faces)
-    cells, weights = _like(problem.own_cells, coarse), np.where(hard, np.inf, soft)
+    cells = _like(problem.own_cells, coarse)
     made = precompute(coarse, taken, cells=cells, handle_weights=weights, dtype=problem.dtype)
     nearest, share = _neighbours(_places(mesh, points, component), everywhere)
     return CoarseProblem(
@@ -239,7 +237,7 @@ def _coarse_rigidity(
     nearest: Int[Array, "vertices"],
     rigidity: Float[Array, "vertices"],
 ) -> Float[Array, "coarse"]:
-    """Return the rigidity of the same material: the mean for each area of the fine cells near."""
+    """Return the rigidity of the same material: of the fine cells near, for each area."""
     area = jnp.maximum(jnp.sum(fine.principal_moments, axis=0), 0.0)
     zero = jnp.zeros_like(coarse.soft)
     weight = zero.at[nearest].add(area)

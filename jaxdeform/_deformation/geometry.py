@@ -15,11 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdeform._arrays import as_array, is_concrete
-from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.system import System
-from jaxdeform._errors import ArrayLike, InputError, have
-from jaxdeform._linalg.buckets import fill_up
+from jaxdeform._errors import InputError
 from jaxdeform._mesh.cells import Cells
 from jaxdeform._mesh.laplacian import cotangent_weights, opposite_edges
 
@@ -42,41 +39,8 @@ class Graph(eqx.Module):
     """True where the weight is the cotangent weight, and so a function of the rest shape."""
 
 
-def read_geometry(
-    problem: Problem, rest: ArrayLike | None, edge_weights: ArrayLike | None
-) -> "Geometry":
-    """Return the geometry from the problem's own rest positions and weights, or raise InputError.
-
-    They are given only for derivatives with respect to them. Other values than the problem's are
-    refused.
-    """
-    cells, dtype = problem.own_cells, problem.dtype
-    graph = _graph_of(cells, dtype)
-    moved = problem.vertices if rest is None else rest
-    moved = as_array(moved, dtype, "rest")
-    weights = cells.weights if edge_weights is None else edge_weights
-    weights = as_array(weights, dtype, "edge_weights")
-    own = (
-        ("rest", moved, problem.vertices, "vertex"),
-        ("edge_weights", weights, cells.weights, "edge"),
-    )
-    for name, given, known, unit in own:
-        if given.shape != known.shape:
-            raise InputError(f"{name} {have(name)} shape {given.shape}, expected {known.shape}")
-        if is_concrete(given):
-            size = max(np.abs(known).max(), 1e-300)
-            far = ~(np.abs(np.asarray(given) - known) <= 1e3 * np.finfo(dtype).eps * size)
-            if far.any():
-                raise InputError(
-                    f"{name} of {unit} {np.argwhere(far)[0][0]} are not the problem's own: they "
-                    "are given only for derivatives; call precompute for another rest shape"
-                )
-    center = problem.system.center
-    moved = jnp.asarray(fill_up(moved.T - center[:, None], problem.bucket))
-    return _geometry_of(graph, moved, weights, edge_weights is not None)
-
-
-def _graph_of(cells: Cells, dtype: np.dtype) -> Graph:
+def graph_of(cells: Cells, dtype: np.dtype) -> Graph:
+    """Return the graph of cells."""
     mesh = cells.mesh
     count = np.diff(cells.membership.indptr)
     index = lambda x: jnp.asarray(np.ascontiguousarray(x), jnp.int32)  # noqa: E731
@@ -100,7 +64,7 @@ class Geometry(NamedTuple):
     graph: Graph
 
 
-def _geometry_of(
+def geometry_of(
     graph: Graph, rest: Float[Array, "3 vertices"], weights: Float[Array, "edges"], given: bool
 ) -> Geometry:
     """Return the geometry; weights that are not ``given`` follow the rest shape where they can."""

@@ -163,6 +163,5 @@ def _symmetric(lower: Matrix) -> sp.csc_matrix:
     return matrix + sp.tril(matrix, -1).T
 
 
-_INTERFACE = installed_interface()
-metric_key = HostFunction("jaxdeform_metric_key", _key_on_host, _INTERFACE)
-metric_solve = HostFunction("jaxdeform_metric_solve", _solve_on_host, _INTERFACE)
+metric_key = HostFunction("jaxdeform_metric_key", _key_on_host, installed_interface())
+metric_solve = HostFunction("jaxdeform_metric_solve", _solve_on_host, installed_interface())

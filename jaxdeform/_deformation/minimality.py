@@ -16,7 +16,7 @@ from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.metric import metric_of
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._deformation.reduced_energy import Inputs, ReducedEnergy
-from jaxdeform._deformation.saddles import lowest_curvature
+from jaxdeform._deformation.saddles import lowest_curvature, negative_below
 from jaxdeform._deformation.system import System
 from jaxdeform._errors import ArrayLike
 
@@ -74,4 +74,4 @@ def _look(
     metric = metric_of(system, energy.local, inputs.rigidity)
     found = lowest_curvature(energy, system, inputs, metric, p, at.transforms, most=_MOST)
     stationary = found.gain <= _STATIONARY * jnp.abs(at.energy) + at.rounding
-    return stationary & (found.value >= 0.0)
+    return stationary & (found.value >= negative_below(shape.dtype))

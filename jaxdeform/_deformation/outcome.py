@@ -19,7 +19,7 @@ def outcome_of(system: System, inputs: Inputs, end: Descent) -> Result:
     """
     energy = end.energy[end.steps]
     finite = jnp.isfinite(energy) & jnp.all(jnp.isfinite(end.positions))
-    moved = jnp.where(system.free[None], system.rest, inputs.targets)
+    moved = jnp.where(system.led[None], inputs.targets, system.rest)
     both = jnp.concatenate([system.rest, moved], axis=1)
     low, high = both.min(axis=1, keepdims=True), both.max(axis=1, keepdims=True)
     margin = _FAR * jnp.sqrt(jnp.sum((high - low) ** 2))
@@ -34,9 +34,11 @@ def outcome_of(system: System, inputs: Inputs, end: Descent) -> Result:
     )
     if inputs.geometry is not None:
         given = inputs.geometry
-        for value, own in ((given.rest, system.rest), (given.weights, given.graph.weights)):
-            near = max(1e-6, 1e3 * float(jnp.finfo(own.dtype).eps))  # as read_geometry has it
-            valid &= jnp.all(jnp.abs(value - own) <= near * jnp.max(jnp.abs(own)))
+        far = jnp.max(jnp.abs(system.center))  # from the origin: so much was rounded
+        known = (given.rest, system.rest, far), (given.weights, given.graph.weights, 0.0)
+        for value, own, more in known:
+            allowed = max(1e-6, 1e3 * float(jnp.finfo(own.dtype).eps))
+            valid &= jnp.all(jnp.abs(value - own) <= allowed * (jnp.max(jnp.abs(own)) + more))
     result = Result.where(finite & ~proportionate, Result.out_of_proportion, end.result)
     result = Result.where(finite, result, Result.not_finite)
     return Result.where(valid, result, Result.bad_input)

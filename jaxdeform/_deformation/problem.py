@@ -79,6 +79,13 @@ class Problem(eqx.Module):
         return self.mesh.vertices
 
     @property
+    def handle_weights(self) -> Float[np.ndarray, "handles"]:
+        """The weight of each handle, an area; infinite where it is hard."""
+        handles = np.asarray(self.handles)
+        hard = ~np.asarray(self.system.free)[handles]
+        return np.where(hard, np.inf, np.asarray(self.system.soft, np.float64)[handles])
+
+    @property
     def dtype(self) -> np.dtype:
         """Type of all numbers: float64 where JAX is set to it, else float32."""
         return np.dtype(self.system.rest.dtype)

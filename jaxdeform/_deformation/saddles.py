@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdeform._deformation.metric import Metric, apply_metric
@@ -85,6 +86,11 @@ def lowest_curvature(
     return as_member(look_at_all, system, (inputs, metric, p, transforms, jnp.asarray(wanted)))
 
 
+def negative_below(dtype: np.dtype) -> float:
+    """Return the curvature from which on it counts as negative: it is known to rounding only."""
+    return -1e-5 if dtype == jnp.float64 else -1e-3
+
+
 class _Way(NamedTuple):
     """A descent that goes on after saddles."""
 
@@ -93,7 +99,7 @@ class _Way(NamedTuple):
     along: Float[Array, "3 vertices"]
     """The way on from the best end, as long as the next try should go."""
     at_saddle: Bool[Array, ""]
-    """Whether the best end is known to be one."""
+    """Whether the best end is known to be one, which a way on would leave for a lower one."""
     in_valley: Bool[Array, ""]
     """Whether the descent stopped in a valley with much left to gain: see `leave_saddles`."""
     tolerance: Float[Array, ""]
@@ -110,14 +116,15 @@ def leave_saddles(
     """Descend; from a saddle go on along its direction of negative curvature.
 
     ``size`` is that of the mesh. Returns where it ended, and whether that is a saddle still. Where
-    a way on ends higher, as it may in a crumpled mesh, a shorter one is tried.
+    a way on ends higher, as it may in a crumpled mesh, a shorter one is tried. Where no way on
+    gains more than the tolerance, the saddle counts as the end.
 
     In a long valley a step of the metric gains little though much is to be gained: with the lowest
     curvature c, up to 1 / c times as much. Where that is above 100 tolerances, it goes on with a
     lower one, in float64. (A plate stopped at an energy of 36.03 with c = 0.0015; the valley ends
     at 24.77.)
     """
-    negative = -1e-5 if start.dtype == jnp.float64 else -1e-3
+    negative = negative_below(start.dtype)
     # The energy is a difference of sums some 600 times as large.
     rounding = 1e3 * jnp.finfo(start.dtype).eps
 

@@ -15,13 +15,13 @@ from jaxdeform._checks import check_flag
 from jaxdeform._deformation.arguments import (
     DeformSettings,
     from_center,
+    read_geometry,
     read_inputs,
     read_settings,
     read_vertices,
 )
 from jaxdeform._deformation.cell_energy import cell_energies
 from jaxdeform._deformation.descent import Adjoint, Anchor, Descent, Solver
-from jaxdeform._deformation.geometry import read_geometry
 from jaxdeform._deformation.local_step import LocalStep, Newton
 from jaxdeform._deformation.outcome import inside_out, outcome_of
 from jaxdeform._deformation.problem import Problem, check_problem

@@ -8,6 +8,7 @@ import numpy as np
 from jaxdeform._arrays import is_concrete
 from jaxdeform._deformation.problem import Problem, check_problem
 from jaxdeform._errors import InputError, a_or_an
+from jaxdeform._linalg.cholesky import own_factors
 
 
 def stack_problems(problems: Sequence[Problem]) -> Problem:
@@ -64,7 +65,9 @@ def stack_problems(problems: Sequence[Problem]) -> Problem:
             )
     systems = [problem.system for problem in problems]
     stacked = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *systems)
-    return Problem(jax.device_put(stacked), np.stack([p.handles for p in problems]), None)
+    system = jax.device_put(stacked)
+    own_factors(system)
+    return Problem(system, np.stack([p.handles for p in problems]), None)
 
 
 def _shapes(problem: Problem) -> object:

@@ -23,8 +23,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 # A step changes a rigidity by at most this factor (20): a full Gauss-Newton step from rubber lands
 # where everything is rigid, and no derivative leads back from there.
 _LARGEST_STEP = 3.0
-# A step shorter than this is not worth an evaluation; nor is a shorter one after a rejected one of
-# this length.
+# A step shorter than the first is not worth an evaluation. After a rejected step no longer than the
+# second, none is tried.
 _SHORTEST_STEP, _SHORTEST_RETRY = 1e-9, 1e-6
 # A few unknowns are searched until a step is expected to lower the cost by less than this fraction,
 # or by less than this fraction of what one of so many values contributes: a step of 0.03 standard

@@ -174,12 +174,13 @@ class _Sizes:
     def with_sizes(self, sizes: tuple[int, ...]) -> Problem:
         """Return the problem with cells of these sizes."""
         problem = self.problem
-        handles, system = np.asarray(problem.handles), problem.system
-        soft = np.asarray(system.free)[handles]
-        weights = np.where(soft, np.asarray(system.soft)[handles], np.inf)
         wide = rings(problem.mesh, np.array(sizes)[self.label], weights=problem.own_cells.weights)
         return precompute(
-            problem.mesh, handles, cells=wide, handle_weights=weights, dtype=problem.dtype
+            problem.mesh,
+            problem.handles,
+            cells=wide,
+            handle_weights=problem.handle_weights,
+            dtype=problem.dtype,
         )
 
 

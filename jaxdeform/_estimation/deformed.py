@@ -54,7 +54,7 @@ def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoi
         start = observed if isinstance(adjoint, Implicit) else None
         out = deform(problem, targets, field, solver=solver, adjoint=adjoint, start=start)
         found.append(State(out.vertices, out.transforms))
-    return wait_for(found)
+    return found
 
 
 class Known(NamedTuple):

@@ -33,7 +33,7 @@ class Patterns(NamedTuple):
     strength: Float[np.ndarray, "patterns"]
     """Squares of the lengths of J times the vectors, which are orthogonal."""
     data: Float[np.ndarray, "patterns"]
-    """Products of these with y = J t - residual."""
+    """Products of these with y = J (t - mean of t) - residual: a constant field costs nothing."""
     size: float
     """Square of y."""
 
@@ -83,18 +83,22 @@ def most_probable(patterns: Patterns, count: int, floor: float, ends: tuple[floa
     ``floor`` is the least noise of a coordinate.
     """
     steps = int(np.ceil(_DENSITY * np.log10(ends[1] / ends[0]))) + 1
-    tried = np.geomspace(*ends, max(steps, 2))
-    costs, noises = zip(*(_cost(patterns, count, floor, weight) for weight in tried), strict=True)
-    best = int(np.argmin(costs))
-    return Evidence(float(tried[best]), float(noises[best]))
+    tried = np.geomspace(*ends, steps)
+    weight = min(tried, key=lambda weight: _cost(patterns, count, floor, weight))
+    return with_noise(patterns, count, floor, float(weight))
 
 
-def _cost(patterns: Patterns, count: int, floor: float, weight: float) -> tuple[float, float]:
-    """Return -2 log of the probability of the poses, and the noise that makes it largest."""
+def with_noise(patterns: Patterns, count: int, floor: float, weight: float) -> Evidence:
+    """Return a weight with the noise under which it makes the poses most probable."""
     explained = np.sum(patterns.data**2 / (patterns.strength + weight))
     left = max(patterns.size - float(explained), count * floor**2)
-    noise = left / count
-    return count * np.log(noise) + np.sum(np.log1p(patterns.strength / weight)), np.sqrt(noise)
+    return Evidence(weight, float(np.sqrt(left / count)))
+
+
+def _cost(patterns: Patterns, count: int, floor: float, weight: float) -> float:
+    """Return -2 log of the probability of the poses, under the noise that makes it largest."""
+    noise = with_noise(patterns, count, floor, weight).noise
+    return 2.0 * count * np.log(noise) + np.sum(np.log1p(patterns.strength / weight))
 
 
 def deviations(

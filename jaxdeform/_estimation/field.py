@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float
 from jaxdeform._checks import check_choice, check_count, check_flag, check_function, check_tolerance
 from jaxdeform._deformation.adjoint import Implicit
 from jaxdeform._deformation.descent import Adjoint, Solver, choose_adjoint
-from jaxdeform._deformation.problem import Problem, rigidity_from_material
+from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.quasi_newton import QuasiNewton
 from jaxdeform._errors import ArrayLike
-from jaxdeform._estimation.evidence import Evidence, deviations
+from jaxdeform._estimation.evidence import deviations
 from jaxdeform._estimation.field_search import FieldSearch
-from jaxdeform._estimation.poses import check_poses, check_start, log_bounds
+from jaxdeform._estimation.poses import MEDIUM, check_poses, check_start, log_bounds, sizes
 from jaxdeform._result import Result, check_result, succeeded
 
-# A step to 1e-2 and patterns need no exact derivatives: half the time of the default.
+# Steps are solved to 3e-2 only, so derivatives need not be exact: half the time of the default.
 _ADJOINT = Implicit(tolerance=1e-5)
 # Half-width of the 95 % interval of the normal distribution, in standard deviations.
 _NORMAL_95 = 1.959964
@@ -125,15 +125,14 @@ def estimate_rigidity_field(
         adjoint = _ADJOINT
     adjoint = choose_adjoint(solver, adjoint)
     poses = check_poses(problem, observed, targets, mask)
-    size = _sizes(problem)
-    medium = np.full(len(size), 0.1 * np.median(size))
+    size = sizes(problem)
+    medium = np.full(len(size), MEDIUM * np.median(size))
     bounds = log_bounds(size).astype(problem.dtype)
     theta = np.clip(np.log(check_start(start, medium, "vertex")), *bounds)
     search = FieldSearch(problem, poses, bounds, solver, adjoint, max_evaluations, progress)
     smooth = search.run(theta, smoothness)
-    noise = search.evidence(smooth.patterns, (smooth.weight, smooth.weight)).noise
-    variances = search.prior.variances()
-    spread = deviations(smooth.patterns, variances, Evidence(smooth.weight, noise))
+    evidence = search.evidence(smooth)
+    spread = deviations(smooth.patterns, search.prior.variances(), evidence)
     center = smooth.theta(problem)
     ends = _NORMAL_95 * spread[:, None] * np.array([-1.0, 1.0])
     found = smooth
@@ -144,16 +143,10 @@ def estimate_rigidity_field(
         interval=np.exp(center[:, None] + ends),
         determined=ends[:, 1] <= np.log(10.0),
         smoothness=found.weight / problem.mesh.diagonal**2,
-        noise=noise,
+        noise=evidence.noise,
         vertices=found.vertices(problem),
         misfit=search.misfit(found.run),
         history=np.array(search.history),
         result=found.result,
     )
     return check_result(out, throw)
-
-
-def _sizes(problem: Problem) -> Float[np.ndarray, "vertices"]:
-    """Return the rigidity of each vertex at material constant 1 (flat cells: their mean)."""
-    size = np.asarray(rigidity_from_material(problem, 1.0), np.float64)
-    return np.where(size > 0, size, size.mean())

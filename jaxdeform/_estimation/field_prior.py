@@ -60,7 +60,7 @@ class Prior(NamedTuple):
         shifted = laplacian + _SHIFT * sp.identity(size)
         positions = fill_up(mesh.vertices.T, size).T
         factor = factorise(shifted.tocsr(), np.ones(size, bool), problem.dtype, positions=positions)
-        most = max(bucket(len(weights)), bucket(3 * size))  # closed meshes have 3 edges a vertex
+        most = bucket(max(len(weights), 3 * size))  # closed meshes have 3 edges a vertex
         root = fill_up(np.sqrt(weights).astype(problem.dtype), most)
         edges = fill_up(mesh.edges.T.astype(np.int32), most).T
         inside = fill_up(np.ones(mesh.n_vertices, bool), size)

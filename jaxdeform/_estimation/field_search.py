@@ -17,7 +17,13 @@ from jaxdeform._deformation.problem import Problem
 from jaxdeform._deformation.system import System
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation, ray_solver
 from jaxdeform._estimation.deformed import Known, as_known, pose, states
-from jaxdeform._estimation.evidence import Evidence, Patterns, find_patterns, most_probable
+from jaxdeform._estimation.evidence import (
+    Evidence,
+    Patterns,
+    find_patterns,
+    most_probable,
+    with_noise,
+)
 from jaxdeform._estimation.field_prior import FLAT, Prior, Solve, WithPrior
 from jaxdeform._estimation.poses import Poses, same_length
 from jaxdeform._estimation.search import search
@@ -74,20 +80,21 @@ class FieldSearch:
         strength, count = found.patterns.strength, self.poses.count
         freedom = np.sum(strength / (strength + found.weight))
         most = strongest = np.inf
+        prior = self.prior
         if smoothness is None:
             strongest = self.problem.mesh.diagonal**2 * _SMOOTHEST / FLAT
             most = self.misfit(found.run) * np.sqrt(count / max(count - freedom, 1.0))
             most *= 1.0 + 1.0 / np.sqrt(2.0 * count)  # it is known to that
         for k in range(_REWEIGHTINGS):
-            theta, before = found.run.theta, self.prior
-            self.prior = Prior.of(self.problem, found.theta(self.problem))
+            theta, before = found.run.theta, prior
+            prior = Prior.of(self.problem, found.theta(self.problem))
             # As strong as the smooth prior at first. (A constant field costs nothing under either.)
-            costs = [max(prior.value(theta), 1e-300) for prior in (before, self.prior)]
+            costs = [max(x.value(theta), 1e-300) for x in (before, prior)]
             stronger = _STRONGER if k else costs[0] / costs[1]
             weight = found.weight * (1.0 if smoothness else stronger)
             if weight > strongest:
                 break
-            run, result = self._descend(found.run, weight, self._left)
+            run, result = self._descend(found.run, prior, weight, self._left)
             if not succeeded(result):
                 return found._replace(result=result)
             if self.misfit(run) > most:
@@ -104,10 +111,11 @@ class FieldSearch:
 
     def _most_probable(self, found: "FieldFound") -> "FieldFound":
         """Search on, under the smoothness that the poses make most probable."""
-        unit = self.problem.mesh.diagonal**2
+        unit, floor = self.problem.mesh.diagonal**2, same_length(self.problem)
         for _ in range(_ROUNDS):
             run, weight, result, patterns = found
-            better = self.evidence(patterns, (unit * _ROUGHEST, unit * _SMOOTHEST)).weight
+            ends = unit * _ROUGHEST, unit * _SMOOTHEST
+            better = most_probable(patterns, self.poses.count, floor, ends).weight
             if max(better / weight, weight / better) < _SAME or not succeeded(result):
                 break
             # Down by the stages that are left; up at once.
@@ -115,15 +123,16 @@ class FieldSearch:
             found = self._relax(run, np.append(stages, better))
         return found
 
-    def evidence(self, patterns: Patterns, ends: tuple[float, float]) -> Evidence:
-        """Return the most probable weight and noise."""
-        return most_probable(patterns, self.poses.count, same_length(self.problem), ends)
+    def evidence(self, found: "FieldFound") -> Evidence:
+        """Return the weight of a search, and the noise that the poses have under it."""
+        floor = same_length(self.problem)
+        return with_noise(found.patterns, self.poses.count, floor, found.weight)
 
     def _relax(self, run, weights) -> "FieldFound":
         """Search under each weight, under the last to the end."""
         for weight in weights[:-1]:
-            run, _ = self._descend(run, weight, _STAGE_EVALUATIONS)
-        run, result = self._descend(run, weights[-1], self._left)
+            run, _ = self._descend(run, self.prior, weight, min(_STAGE_EVALUATIONS, self._left))
+        run, result = self._descend(run, self.prior, weights[-1], self._left)
         return FieldFound(run, float(weights[-1]), result, find_patterns(run, self.prior))
 
     @property
@@ -131,8 +140,8 @@ class FieldSearch:
         """Evaluations that are left."""
         return max(self.limit - len(self.history), 0)
 
-    def _descend(self, run, weight, limit: int) -> tuple["_Linearised", Result]:
-        first = _FieldFit(run, self.prior, jnp.asarray(weight, run.theta.dtype))
+    def _descend(self, run, prior: Prior, weight, limit: int) -> tuple["_Linearised", Result]:
+        first = _FieldFit(run, prior, jnp.asarray(weight, run.theta.dtype))
         solver = ray_solver(self.bounds[0], self.bounds[1], first.solve, _GAIN)
         evaluate = lambda theta: first._replace(run=self._evaluate(theta))  # noqa: E731
         found = search(evaluate, first, solver, limit)

@@ -78,12 +78,14 @@ def find_handle_noise(
     """
     system, whole = problem.system, problem.bucket
     everywhere = fill_up(np.asarray(field, problem.dtype), whole)
-    exactness = adjoint, adjoint
+    finding = measuring = adjoint
     if isinstance(adjoint, Implicit):
-        loosest = max(adjoint.tolerance, _FINDING), max(adjoint.tolerance, _MEASURING)
-        exactness = tuple(replace(adjoint, tolerance=tolerance) for tolerance in loosest)
+        finding, measuring = (
+            replace(adjoint, tolerance=max(adjoint.tolerance, least))
+            for least in (_FINDING, _MEASURING)
+        )
     count = min(_MODES, poses.targets[0].size)
-    settings = {"count": count, "solver": solver, "adjoints": exactness}
+    settings = {"count": count, "solver": solver, "adjoints": (finding, measuring)}
     each = [
         _modes(
             system, as_known(problem, targets, end), fill_up(seen, whole), everywhere, **settings

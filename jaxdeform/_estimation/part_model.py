@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxdeform._deformation.descent import Adjoint, Solver
-from jaxdeform._deformation.problem import Problem, rigidity_from_material
+from jaxdeform._deformation.problem import Problem
 from jaxdeform._estimation.bounded_gauss_newton import Evaluation
 from jaxdeform._estimation.deformed import PoseDerivatives, State, deform_all, states
 from jaxdeform._estimation.noise import HandleNoise
-from jaxdeform._estimation.poses import Poses, check_start, log_bounds
+from jaxdeform._estimation.poses import MEDIUM, Poses, check_start, log_bounds, sizes
 
 
 class Fit(NamedTuple):
@@ -71,10 +71,8 @@ class PartModel:
     @classmethod
     def build(cls, problem, poses, label, solver, adjoint) -> "PartModel":
         """Measure the parts: a part is as large as its typical cell."""
-        scale = np.asarray(rigidity_from_material(problem, 1.0), np.float64)
-        size = np.array([np.median(scale[label == k]) for k in range(label.max() + 1)])
-        # Cells without area must have a size too.
-        size = np.where(size > 0, size, scale.mean())
+        each = sizes(problem)
+        size = np.array([np.median(each[label == k]) for k in range(label.max() + 1)])
         return cls(problem, poses, label, solver, adjoint, size)
 
     @property
@@ -84,7 +82,7 @@ class PartModel:
 
     def start(self, given) -> Float[np.ndarray, "parts"]:
         """Return the log rigidity to start from: that given, or a medium material."""
-        return np.clip(np.log(check_start(given, 0.1 * self.size, "part")), *self.bounds)
+        return np.clip(np.log(check_start(given, MEDIUM * self.size, "part")), *self.bounds)
 
     def field(self, theta: np.ndarray) -> Float[np.ndarray, "vertices"]:
         """Return the rigidity of each vertex."""

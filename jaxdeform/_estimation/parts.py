@@ -34,6 +34,7 @@ from jaxdeform._result import Result, check_result, succeeded
 # Rounds of leaving out vertices that were seen in a wrong place: by more than this fraction of the
 # diagonal, which is ten times what solvers leave at their default tolerance.
 _OUTLIER_ROUNDS, _MISPLACED = 3, 1e-4
+_MAX_EVALUATIONS = 50
 
 
 def estimate_rigidity(
@@ -48,7 +49,7 @@ def estimate_rigidity(
     solver: Solver = QuasiNewton(leave_saddles=False),  # noqa: B008 (frozen)
     adjoint: Adjoint | None = None,
     determined_within: float = 10.0,
-    max_evaluations: int = 50,
+    max_evaluations: int = _MAX_EVALUATIONS,
     progress: Callable[[int, float, np.ndarray], None] | None = None,
     throw: bool = False,
 ) -> Estimate:
@@ -81,8 +82,9 @@ def estimate_rigidity(
     - mask: (vertices,) or (poses, vertices), False where a vertex was not seen; its position is not
       read. Or a selection of the vertices that were seen.
     - start: first guess, a number or (parts,); a medium material by default.
-    - solver, adjoint: as in `deform`. Poses that were made by 100 steps of the thesis's
-      iteration are no equilibria: fit those with ``Alternating(steps=100)``.
+    - solver, adjoint: as in `deform`, but without a look for saddles: poses are observed minima,
+      and deformations start from them. Poses that were made by 100 steps of the thesis's iteration
+      are no equilibria: fit those with ``Alternating(steps=100)``.
     - determined_within: a side of an interval is open if its end is more than this factor from the
       best value (for the verdict).
     - max_evaluations: limit of the search; intervals need more evaluations.
@@ -120,10 +122,10 @@ def estimate_rigidity(
     return check_result(_judge(found, poses.counted, max(determined_within, 1.0)), throw)
 
 
-def least_squares(model: PartModel, theta: np.ndarray, limit: int = 50) -> Found:
+def least_squares(model: PartModel, theta: np.ndarray) -> Found:
     """Search for the least misfit alone: no outliers, no noise of the handles, no intervals."""
-    search = _Search(model, 0.0, limit, None)
-    return search.descend(search.evaluate(theta, HandleNoise.none(model.poses)))
+    alone = _Search(model, 0.0, _MAX_EVALUATIONS, None)
+    return alone.descend(alone.evaluate(theta, HandleNoise.none(model.poses)))
 
 
 def is_exact(model: PartModel, fit: Fit) -> bool:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from jaxdeform._arrays import read_host_array
 from jaxdeform._baselines.laplacian_editing import laplacian_editing
-from jaxdeform._deformation.problem import Problem, check_problem
+from jaxdeform._deformation.problem import Problem, check_problem, rigidity_from_material
 from jaxdeform._errors import InputError
 from jaxdeform._estimation.resemblance import check_resemblance
 from jaxdeform._mesh.mesh import Mesh
@@ -17,13 +17,15 @@ from jaxdeform._values import read_positions, read_rigidity
 # Outside this range of material constants (rigidity over tr(B) / 2) nothing changes any more: the
 # bar moves by less than 1e-6 of its size from there to zero and to infinity.
 _SOFTEST, _STIFFEST = 1e-7, 1e5
+# Where searches start: poses change most around it, from rubber to steel.
+MEDIUM = 0.1
 # Positions closer than this fraction of the bounding box diagonal are the same: float32 files round
 # to it, and the solvers stop there.
 _EQUAL = 1e-8
 
 
 class Poses(NamedTuple):
-    """The observed poses, as compiled functions take them."""
+    """The observed poses, checked, in NumPy."""
 
     targets: Float[np.ndarray, "poses handles 3"]
     observed: Float[np.ndarray, "poses vertices 3"]
@@ -45,6 +47,12 @@ class Poses(NamedTuple):
 def same_length(problem: Problem) -> float:
     """Return the length below which positions are the same."""
     return max(_EQUAL, 2.0 * float(np.finfo(problem.dtype).eps)) * problem.mesh.diagonal
+
+
+def sizes(problem: Problem) -> Float[np.ndarray, "vertices"]:
+    """Return the rigidity of each vertex at material constant 1 (flat cells: their mean)."""
+    size = np.asarray(rigidity_from_material(problem, 1.0), np.float64)
+    return np.where(size > 0, size, size.mean())
 
 
 def log_bounds(size: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "2 unknowns"]:

@@ -13,7 +13,6 @@ from jaxdeform._deformation.solve import deform
 from jaxdeform._errors import ArrayLike, InputError
 from jaxdeform._estimation.deformed import residual_of
 from jaxdeform._estimation.poses import check_poses
-from jaxdeform._linalg.waiting import wait_for
 from jaxdeform._result import Result, check_result
 
 
@@ -80,7 +79,7 @@ def estimate_rigidity_thesis(
     rigidity, path, history = float(start), [], []
     result = Result.evaluation_limit
     for _ in range(max_evaluations):
-        vertices = wait_for(deform(problem, poses.targets[0], rigidity, solver=solver).vertices)
+        vertices = deform(problem, poses.targets[0], rigidity, solver=solver).vertices
         path.append(rigidity)
         history.append(float(np.linalg.norm(residual_of(poses, vertices[None]))))
         step = step_size * history[-1]

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import jax
@@ -47,14 +46,14 @@ def side_by_side(function: Callable[[Any, Any], Any], shared: Any, own: Any) -> 
 
     Under vmap over ``own`` there are only more members. In a program whose members are sharded over
     devices, each device works off its own: XLA by itself would gather whatever goes through a loop
-    or to the host, and do the work of all on every device. It does so where the host is called by
-    ``jax.pure_callback`` (host_call.py), which crashes in a divided program (jax 0.10).
+    or to the host, and do the work of all on every device. That is left to it where the host is
+    called by ``jax.pure_callback`` (host_call.py), which crashes in a divided program (jax 0.10).
     """
 
     @custom_vmap
     def run(shared, own):
         members = jax.tree.leaves(own)[0].shape[0]
-        if members == 1 or not _calls_by_address() or has_accelerator():
+        if members == 1 or installed_interface() is None or has_accelerator():
             return function(shared, own)
         try:
             return _divided(function, shared)(shared, own)
@@ -82,11 +81,6 @@ def as_member(function: Callable[[Any, Any], Any], shared: Any, own: Any) -> Any
     """
     out = side_by_side(function, shared, jax.tree.map(lambda x: x[None], own))
     return jax.tree.map(lambda x: x[0], out)
-
-
-@cache
-def _calls_by_address() -> bool:
-    return installed_interface() is not None
 
 
 def _divided(function: Callable[[Any, Any], Any], shared: Any) -> Callable[[Any, Any], Any]:

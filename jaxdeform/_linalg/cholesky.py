@@ -113,6 +113,14 @@ def factorise(
     return factor
 
 
+def own_factors(stack: Any) -> None:
+    """Keep the factors on the host that are in a stack of systems for as long as it lives."""
+    is_factor = lambda x: isinstance(x, HostCholesky)  # noqa: E731
+    for factor in filter(is_factor, jax.tree.leaves(stack, is_leaf=is_factor)):
+        for key in np.asarray(factor.key):
+            factors.own(key, factor.key)
+
+
 def dense_inverse(
     matrix: sp.spmatrix,
     free: Bool[np.ndarray, "vertices"],

@@ -32,9 +32,10 @@ _ENTRIES = (4.25, 12.0, 16.0, 24.0)
 
 # What all factors of a process may take together. The one made last stays in any case.
 CAPACITY = int(os.environ.get("JAXDEFORM_FACTOR_BYTES", 2 << 30))
-# What those may take whose problem is gone. They are not freed at once, because JAX does not wait:
-# a deformation may still run when its problem has been collected.
-_LEFT_OVER = 64 << 20
+# What those may take that no problem owns, the last two aside: those of problems that are gone, and
+# all metrics (metric_factor.py). They are not freed at once, because JAX does not wait: a
+# deformation may still run when its problem has been collected.
+_UNOWNED = 64 << 20
 # A factor takes 5 to 8.4 bytes for each entry of the lower triangle times log2 n (measured for
 # both matrices of 722, 4,802 and 50,298 vertices); the copy of the matrix beside it takes 12.
 _FACTOR_BYTES, _MATRIX_BYTES = 8.5, 12
@@ -166,7 +167,7 @@ class _Entry:
     def __init__(self) -> None:
         self.factor: Future[HostFactor] = Future()
         self.size = 0
-        self.left_over = False
+        self.unowned = False
 
 
 class FactorCache:
@@ -215,7 +216,7 @@ class FactorCache:
             missing = entry is None
             if entry is None:
                 entry = self._entries[name] = _Entry()
-                entry.left_over = key.tobytes() not in self._owners
+                entry.unowned = key.tobytes() not in self._owners
             self._entries.move_to_end(name)
         if missing:
             self._make(name, entry, make)
@@ -227,7 +228,7 @@ class FactorCache:
         with self._lock:
             self._owners[name] += 1
             for entry in self._of(name):
-                entry.left_over = False
+                entry.unowned = False
         # The collector may run anywhere, also in a thread that has the lock: so it only notes.
         weakref.finalize(owner, self._collected.append, name).atexit = False
 
@@ -266,11 +267,11 @@ class FactorCache:
             if not self._owners[key]:
                 del self._owners[key]
                 for entry in self._of(key):
-                    entry.left_over = True
+                    entry.unowned = True
         rest = [x for x, entry in self._entries.items() if x != made and entry.factor.done()]
-        left_over = [x for x in rest if self._entries[x].left_over]
-        self._shrink(left_over, _LEFT_OVER, least=2)
-        rest = sorted((x for x in rest if x in self._entries), key=lambda x: x not in left_over)
+        unowned = [x for x in rest if self._entries[x].unowned]
+        self._shrink(unowned, _UNOWNED, least=2)
+        rest = sorted((x for x in rest if x in self._entries), key=lambda x: x not in unowned)
         self._shrink(rest, self.capacity - self._entries[made].size, least=0)
 
     def _shrink(self, names: list[Any], limit: int, least: int) -> None:

@@ -9,6 +9,7 @@ import ctypes
 import math
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -145,6 +146,7 @@ class Interface:
         return C_FUNCTION(create)(ctypes.addressof(args))
 
 
+@cache
 def installed_interface() -> Interface | None:
     """Return the interface of the jaxlib in use; None where its header is missing or unknown."""
     try:

@@ -55,12 +55,14 @@ def lowest_mode(
         alphas, betas = run.alphas.at[k].set(value), run.betas.at[k].set(beta)
         return run._replace(steps=k + 1, state=after, alphas=alphas, betas=betas, x=x)
 
+    def has_ended(run: "_Run") -> Array:
+        """Whether there is no way on, or NaN."""
+        return ~(run.state.beta > 0.0) & (run.steps > 0)
+
     def is_known(run: "_Run") -> Array:
-        beta = run.state.beta
-        error = beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
+        error = run.state.beta * jnp.abs(run.weights[jnp.maximum(run.steps - 1, 0)])
         sure = ~(error >= jnp.abs(run.mu)) & (run.steps > 0)
-        # Without a way on, or with NaN, it is over before.
-        return sure & ((run.steps >= _LEAST) | ~(beta > 0.0)) | (run.steps >= most)
+        return sure & ((run.steps >= _LEAST) | has_ended(run)) | (run.steps >= most)
 
     at = jnp.zeros((), jnp.int32)
     nothing = _Run(at, begin, none, none, jnp.zeros_like(start), zero, none)
@@ -72,16 +74,19 @@ def lowest_mode(
         def look(run: "_Run") -> "_Run":
             soon = jnp.minimum(jnp.maximum(_LEAST, run.steps + run.steps // 2), most)
             until = jnp.where(runs == 0, soon, old.steps)
-            more = lambda run: (run.steps < until) & ((run.state.beta > 0.0) | (run.steps == 0))  # noqa: E731
-            run = jax.lax.while_loop(more, partial(step, old.weights), run)
+            stepping = lambda run: (run.steps < until) & ~has_ended(run)  # noqa: E731
+            run = jax.lax.while_loop(stepping, partial(step, old.weights), run)
             mu, weights = _lowest(run.alphas, run.betas, run.steps)
             return run._replace(mu=mu, weights=weights)
 
-        ended = lambda run: jnp.where(runs == 0, is_known(run), run.steps >= old.steps)  # noqa: E731
-        return runs + 1, jax.lax.while_loop(lambda run: ~ended(run), look, nothing)
+        def done(run: "_Run") -> Array:
+            return jnp.where(runs == 0, is_known(run), (run.steps >= old.steps) | has_ended(run))
 
-    more = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
-    runs, run = jax.lax.while_loop(lambda x: wanted & more(x), again, (at, nothing))
+        return runs + 1, jax.lax.while_loop(lambda run: ~done(run), look, nothing)
+
+    # One loop for both runs, so that the product with the matrix is compiled once.
+    running = lambda carried: (carried[0] == 0) | ((carried[0] == 1) & (carried[1].mu < 0.0))  # noqa: E731
+    runs, run = jax.lax.while_loop(lambda x: wanted & running(x), again, (at, nothing))
     return run.mu, jnp.where(runs == 2, run.x, 0.0)
 
 

@@ -5,6 +5,7 @@ Writes the deformed vertices, the energies and the number of devices.
 
 import sys
 
+import equinox as eqx
 import jax
 
 jax.config.update("jax_enable_x64", True)
@@ -37,4 +38,9 @@ if __name__ == "__main__":
     problem, targets, rigidity = batch()
     out = jd.deform_batch(problem, targets, rigidity)
     found = {"vertices": out.vertices, "energy": out.energy[:, -1]}
+    targets[2, 0] = np.nan
+    try:
+        jd.deform_batch(problem, targets, rigidity, throw=True)
+    except eqx.EquinoxRuntimeError as error:
+        found["raised"] = np.asarray(str(error))
     np.savez(sys.argv[1], devices=jax.device_count(), **found)

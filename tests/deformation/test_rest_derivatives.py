@@ -161,6 +161,19 @@ def test_what_is_taken_for_the_problems_own_converges(case):
         assert bool(out.result == jd.Result.converged), dtype
 
 
+def test_the_problems_own_are_known_far_from_the_origin_too(case):
+    """In float32, where a position is rounded to 1e-4 of the mesh."""
+    mesh, handles, targets, *_ = case
+    move = 900.0 * mesh.diagonal
+    problem = jd.precompute(jd.Mesh(mesh.vertices + move, mesh.faces), handles, dtype=np.float32)
+    weights = problem.cells.weights
+    out = jd.deform(problem, targets + move, 1.0, edge_weights=weights)
+    assert out.result == jd.Result.converged
+    rest = jnp.asarray(problem.vertices, np.float32)
+    run = jax.jit(lambda rest: jd.deform(problem, targets + move, 1.0, rest=rest).result)
+    assert run(rest) == jd.Result.converged
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [jax.jacfwd, jax.grad])
 def test_third_derivatives_to_the_rest_shape_raise(case, first):

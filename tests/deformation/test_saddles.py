@@ -21,6 +21,15 @@ def pushed(bar, bar_problem):
     return hold - np.where(hold[:, 1:2] > 75, [[0.0, 30.0, 0.0]], 0.0)
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_rigid_motion_is_a_minimum(dtype):
+    """Of energy 0, whose curvature is 0 along the turns about its one handle, but for rounding."""
+    mesh = jd.shapes.square()
+    problem = jd.precompute(mesh, [4], dtype=dtype)
+    moved = np.asarray(jd.rotate(mesh.vertices, 40.0, axis="x")) + np.arange(3.0)
+    assert bool(jd.is_minimum(problem, moved[[4]], 1.0, moved))
+
+
 @pytest.mark.slow
 def test_the_curvature_is_that_of_the_energy(bar, bar_problem, pushed):
     """Along the direction that it returns, second differences of the energy are negative."""

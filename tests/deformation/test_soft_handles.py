@@ -42,6 +42,16 @@ def test_a_soft_handle_balances_the_forces(sheet, mixed):
     np.testing.assert_allclose(out.energy[-1], total, rtol=1e-9)
 
 
+def test_targets_far_away_are_followed(sheet):
+    """A move of the whole by 50 diagonals strains nothing, with soft handles as with hard ones."""
+    mesh, handles, _ = sheet
+    move = 50.0 * mesh.diagonal
+    problem = jd.precompute(mesh, handles, handle_weights=10.0)
+    out = jd.deform(problem, mesh.vertices[handles] + move, 1.0)
+    assert out.result == jd.Result.converged
+    np.testing.assert_allclose(out.vertices, mesh.vertices + move, atol=1e-10 * move)
+
+
 def test_a_weight_of_zero_is_no_handle(sheet, mixed):
     (_, soft, _), (mesh, handles, targets) = mixed, sheet
     idle = jd.precompute(mesh, handles, handle_weights=np.where(soft, 0.0, np.inf))

@@ -7,6 +7,7 @@ import pytest
 from helpers import NO_SADDLES
 
 import jaxdeform as jd
+from jaxdeform._linalg import factor_cache
 
 
 def sheet(rows: int, columns: int, height: float) -> jd.Mesh:
@@ -101,3 +102,14 @@ def test_what_cannot_be_stacked_is_named(problems):
             jd.stack_problems(given)
     with pytest.raises(jd.InputError, match="traced"):
         jax.jit(lambda problem: jd.stack_problems([problem]).system.rest)(problems[0])
+
+
+def test_a_stack_keeps_its_factors(problems):
+    """Also when the problems that it was made of are gone."""
+    stack = jd.stack_problems(problems)
+    keys = np.concatenate([stack.system.factor.key, stack.system.initial_guess.factor.key])
+    owners = factor_cache.factors._owners
+    counts = [owners[key.tobytes()] for key in keys]
+    again = jd.stack_problems(problems)
+    assert [owners[key.tobytes()] for key in keys] == [count + 1 for count in counts]
+    assert again.system.factor.key.shape == (3, 4)

@@ -17,6 +17,7 @@ from jaxdeform._estimation.evidence import (
     deviations,
     find_patterns,
     most_probable,
+    with_noise,
 )
 from jaxdeform._estimation.field_prior import FLAT, Prior, Solve, WithPrior
 from jaxdeform._estimation.field_search import _stages
@@ -166,7 +167,7 @@ def test_the_evidence_is_the_density_of_the_poses(linear):
     patterns = find_patterns(linear.run, linear.prior)
     logs = []
     for weight in (0.3, 3.0, 30.0):
-        noise = most_probable(patterns, 30, 1e-12, (weight, weight)).noise
+        noise = with_noise(patterns, 30, 1e-12, weight).noise
         inner = linear.matrix @ np.linalg.solve(linear.definite, linear.matrix.T) / weight
         exact = multivariate_normal.logpdf(linear.seen, cov=noise**2 * (np.eye(30) + inner))
         logs.append((weight, exact))
@@ -194,6 +195,17 @@ def test_the_weight_and_the_noise_behind_the_poses_are_found(exact_problem):
 
 
 # ---------------------------------------------------------------- fields recovered
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_no_more_evaluations_than_allowed(most):
+    mesh = jd.shapes.square()
+    problem = jd.precompute(mesh, [0, 1, 2, 6, 7, 8])
+    targets = jd.twist(mesh.vertices[problem.handles], 60.0, along="y")
+    pose = jd.deform(problem, targets, 0.5).vertices
+    fit = jd.estimate_rigidity_field(problem, pose, start=50.0, max_evaluations=most)
+    assert len(fit.history) <= most
+    assert fit.result == jd.Result.evaluation_limit
 
 
 @pytest.mark.slow

@@ -78,7 +78,7 @@ def test_memory_is_bounded(monkeypatch, matrices):
 
 def test_factors_of_collected_owners_go(monkeypatch, matrices):
     count = made_in(monkeypatch)
-    monkeypatch.setattr(factor_cache, "_LEFT_OVER", 0)
+    monkeypatch.setattr(factor_cache, "_UNOWNED", 0)
     cache = FactorCache(1 << 30)
     owners = [jnp.zeros(3) + k for k in range(8)]
     for pair, owner in zip(matrices, owners, strict=True):
@@ -105,4 +105,4 @@ def test_a_hundred_factors_made_and_dropped(right):
     factor_cache.factors.clear()
     for k in range(100):
         solve(made(k), right)
-    assert factor_cache.factors.size < factor_cache._LEFT_OVER + (8 << 20)
+    assert factor_cache.factors.size < factor_cache._UNOWNED + (8 << 20)
