@@ -181,7 +181,7 @@ def _fit_rings(
         "estimating",
         lambda: jd.estimate_rings(problem, observed, parts=label, most=most, progress=show),
     )
-    console.print(f"rings of the parts: {', '.join(map(str, found.rings))}")
+    console.print(found.explain().splitlines()[0])
     return found.problem, found.fit, found.rings.tolist()
 
 

@@ -54,6 +54,12 @@ class RingsEstimate:
         """True if the fit is: it converged, and the model explains the poses."""
         return self.fit.ok
 
+    def explain(self) -> str:
+        """Return everything in words: the sizes, and what the fit says."""
+        sizes = ", ".join(map(str, self.rings))
+        found = f"rings of the parts: {sizes} (of {len(self.tried)} combinations tried)"
+        return f"{found}\n{self.fit.explain()}"
+
 
 def estimate_rings(
     problem: Problem,

@@ -49,8 +49,8 @@ class Discrepancy(NamedTuple):
         if self.relative > _FOREIGN:
             return f"{text}Are these poses of this mesh? Check unit, frame and order of vertices"
         return text + (
-            "Try more parts or other regions, other rings, handles that moved as given, the solver "
-            "that made the poses"
+            "Try more parts or other regions, larger cells (estimate_rings), handles that moved as "
+            "given, or solver=Alternating(steps) if a fixed number of steps made the poses"
         )
 
 

@@ -83,12 +83,21 @@ class Estimate:
             at = np.argwhere(self.outliers)
             shown = ", ".join(f"{vertex} (pose {pose})" for pose, vertex in at[:3])
             lines.append(f"left out as seen in a wrong place: vertices {shown} ({len(at)} in all)")
+        if self.history.min() < 0.95 * self.misfit:
+            lines.append(
+                "smooth errors count less, because noise of the handles causes them; by least "
+                f"squares alone a misfit of {self.history.min():.3g} was reached"
+            )
         if self.discrepancy.found:
             lines.append(self.discrepancy.explain())
         return "\n".join([*lines, Result[self.result]])
 
     def _explain_part(self, k: int) -> str:
+        if self.result == Result.unsettled:
+            return f"part {k}: {self.rigidity[k]:.4g}, without an interval"
         text = f"part {k}: {in_words(self.verdict[k], self.rigidity[k], self.interval[k])}"
+        if self.discrepancy.found:
+            text += " if the model were right"
         if self.verdict[k] is Verdict.determined:
             text += f", material {self.material[k]:.3g}"
         hidden = self.displacement[k] < _VISIBLE * self.diagonal

@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from jaxdeform._estimation.field_prior import Prior
 from jaxdeform._linalg.waiting import wait_for
@@ -23,6 +25,8 @@ from jaxdeform._linalg.waiting import wait_for
 _PATTERNS = 48
 # Weights tried, per factor of ten.
 _DENSITY = 8
+# Vertices whose patches are listed together.
+_PATCHES = 1024
 
 
 class Patterns(NamedTuple):
@@ -36,11 +40,14 @@ class Patterns(NamedTuple):
     """Products of these with y = J (t - mean of t) - residual: a constant field costs nothing."""
     size: float
     """Square of y."""
+    pulls: Float[np.ndarray, "draws vertices"]
+    """J^T times draws of the normal distribution. The products with a change of the field are as
+    large, on average, as the change of the poses that it makes."""
 
 
 def find_patterns(run: Any, prior: Prior) -> Patterns:
     """Return the patterns at an evaluation: its point, residual and Jacobian."""
-    vectors, effects = map(np.asarray, wait_for(_probe(run.jacobian, prior)))
+    vectors, effects, pulls = map(np.asarray, wait_for(_probe(run.jacobian, prior)))
     # Of the generalised eigenproblem in the space that was found.
     metric = vectors.T @ np.asarray(prior.product(jnp.asarray(vectors)))
     root = np.linalg.cholesky(metric)
@@ -51,21 +58,23 @@ def find_patterns(run: Any, prior: Prior) -> Patterns:
     mean = np.mean(np.asarray(run.theta)[:count])
     seen = np.asarray(run.jacobian.mv(run.theta - mean) - run.residual, float)
     data = rotation @ (flat.T @ seen.ravel())
-    return Patterns(vectors[:count], lengths**2, data, float(np.sum(seen**2)))
+    size = float(np.sum(seen**2))
+    return Patterns(vectors[:count], lengths**2, data, size, pulls[:, :count])
 
 
 @eqx.filter_jit
 def _probe(jacobian: lx.FunctionLinearOperator, prior: Prior):
-    """Return a basis of the fields that poses tell of, and its effects."""
+    """Return a basis of the fields that poses tell of, its effects, and the pulls of the draws."""
     transposed = jacobian.transpose()
     shape = jacobian.out_structure()
     draws = jax.random.normal(jax.random.key(0), (_PATTERNS, *shape.shape), shape.dtype)
     pull = jax.vmap(transposed.mv)
     push = jax.vmap(jacobian.mv)
     orthonormal = lambda rows: jnp.linalg.qr(rows.T)[0].T  # noqa: E731
-    fields = orthonormal(prior.factor.solve(pull(draws)))
+    pulls = pull(draws)
+    fields = orthonormal(prior.factor.solve(pulls))
     fields = orthonormal(prior.factor.solve(pull(push(fields))))
-    return fields.T, jnp.moveaxis(push(fields), 0, -1)
+    return fields.T, jnp.moveaxis(push(fields), 0, -1), pulls
 
 
 class Evidence(NamedTuple):
@@ -108,3 +117,23 @@ def deviations(
     known = patterns.strength / (patterns.strength + found.weight)
     variance = prior_variances - patterns.vectors**2 @ known
     return found.noise * np.sqrt(np.maximum(variance, 0.0) / found.weight)
+
+
+def patch_deviations(
+    patterns: Patterns, points: Float[np.ndarray, "vertices 3"], radius: float, noise: float
+) -> Float[np.ndarray, "vertices"]:
+    """Return how far poses alone tell the log rigidity of the patch around each vertex.
+
+    The standard deviation of one change for all vertices within the radius, with nothing else
+    unknown and no prior; infinite where the poses feel nothing of it.
+    """
+    tree, pulls = KDTree(points), patterns.pulls.T
+    effects = np.empty(pulls.shape)
+    for first in range(0, len(points), _PATCHES):
+        some = points[first : first + _PATCHES]
+        near = KDTree(some).sparse_distance_matrix(tree, radius, output_type="ndarray")
+        shape, ones = (len(some), len(points)), np.ones(len(near))
+        inside = sp.csr_matrix((ones, (near["i"], near["j"])), shape=shape)
+        effects[first : first + _PATCHES] = inside @ pulls
+    effect = np.sqrt(np.mean(effects**2, axis=1))
+    return np.divide(noise, effect, out=np.full(len(points), np.inf), where=effect > 0.0)

@@ -8,7 +8,7 @@ weighted by the inverse.
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdeform._deformation.adjoint import Implicit
+from jaxdeform._deformation.descent import Adjoint
 from jaxdeform._deformation.system import System
 from jaxdeform._estimation.deformed import Known, State, as_known, pose
 from jaxdeform._estimation.poses import Poses
@@ -24,6 +25,8 @@ from jaxdeform._linalg.xla import quick_jit
 
 # Of the bar's 438 handle coordinates about 40 move the free vertices by more than themselves.
 _MODES = 32
+# Motions of the handles whose effects are computed together.
+_AT_ONCE = 8
 # Where the handles' noise is smooth, not independent, it is large in the leading ones. As many as
 # two rigid bodies have do as well as the rigid motions of the handles themselves.
 _FREE_MODES = 12
@@ -43,6 +46,8 @@ class HandleNoise(NamedTuple):
     """Orthonormal."""
     size: Float[np.ndarray, "poses modes"]
     """Relative to the noise of a vertex, largest first; infinite where anything may happen."""
+    relative: float = 0.0
+    """The noise of a handle, relative to that of a vertex."""
 
     @classmethod
     def none(cls, poses: Poses) -> "HandleNoise":
@@ -59,7 +64,7 @@ class HandleNoise(NamedTuple):
     def unbounded(self) -> "HandleNoise":
         """The leading directions, with anything allowed along them, and no noise in the others."""
         basis = self.basis[..., :_FREE_MODES]
-        return HandleNoise(basis, np.full((len(basis), basis.shape[2]), np.inf))
+        return self._replace(basis=basis, size=np.full((len(basis), basis.shape[2]), np.inf))
 
     @property
     def free(self) -> Float[np.ndarray, "poses vertices 3 free"]:
@@ -74,51 +79,90 @@ def find_handle_noise(
 ) -> HandleNoise:
     """Return the noise that targets pass on, which have so much more of it than the vertices.
 
-    ``ends`` are the deformations of this field.
+    ``ends`` are the deformations of this field. A randomised range finder (Halko, Martinsson and
+    Tropp 2011): D^T of random vectors spans the motions of the handles that move the free vertices
+    most.
     """
-    system, whole = problem.system, problem.bucket
-    everywhere = fill_up(np.asarray(field, problem.dtype), whole)
-    finding = measuring = adjoint
-    if isinstance(adjoint, Implicit):
-        finding, measuring = (
-            replace(adjoint, tolerance=max(adjoint.tolerance, least))
-            for least in (_FINDING, _MEASURING)
-        )
     count = min(_MODES, poses.targets[0].size)
-    settings = {"count": count, "solver": solver, "adjoints": (finding, measuring)}
-    each = [
-        _modes(
-            system, as_known(problem, targets, end), fill_up(seen, whole), everywhere, **settings
+    motions = partial(_motions, count=count, solver=solver, adjoint=_no_finer(adjoint, _FINDING))
+    found = [motions(*pose) for pose in _known_poses(problem, poses, field, ends)]
+    modes = _effects(problem, poses, field, ends, solver, adjoint, np.asarray(found))
+    basis, size, _ = np.linalg.svd(modes, full_matrices=False)
+    return HandleNoise(basis, relative * size, relative)
+
+
+def random_effects(
+    problem, poses: Poses, field, ends: list[State], solver, adjoint
+) -> Float[np.ndarray, "poses coordinates draws"]:
+    """Return how noise of the handles moves the free vertices: some draws, the same every time.
+
+    The noise is of size 1 in each coordinate. ``ends`` are the deformations of this field.
+    """
+    shape = len(poses.targets), _AT_ONCE, 3, problem.bucket
+    motions = np.random.default_rng(0).standard_normal(shape)
+    is_handle = np.isin(np.arange(problem.bucket), problem.handles)
+    return _effects(problem, poses, field, ends, solver, adjoint, np.where(is_handle, motions, 0.0))
+
+
+def _effects(
+    problem, poses: Poses, field, ends: list[State], solver, adjoint, motions
+) -> Float[np.ndarray, "poses coordinates motions"]:
+    """Return how motions of the handles (poses, motions, 3, vertices) move the free vertices."""
+    adjoint = _no_finer(adjoint, _MEASURING)
+    given = _known_poses(problem, poses, field, ends)
+    moved = [
+        [
+            np.asarray(_moved(*pose, some, solver, adjoint))
+            for some in np.split(own.astype(problem.dtype), range(_AT_ONCE, len(own), _AT_ONCE))
+        ]
+        for pose, own in zip(given, motions, strict=True)
+    ]
+    out = np.stack([np.concatenate(own) for own in moved]).astype(np.float64)
+    out = np.moveaxis(out[..., : problem.n_vertices], 1, -1)
+    return np.swapaxes(out, 1, 2).reshape(len(out), 3 * problem.n_vertices, -1)
+
+
+def _no_finer(adjoint: Adjoint, tolerance: float) -> Adjoint:
+    if not isinstance(adjoint, Implicit):
+        return adjoint
+    return replace(adjoint, tolerance=max(adjoint.tolerance, tolerance))
+
+
+def _known_poses(problem, poses: Poses, field, ends: list[State]) -> list[tuple[Any, ...]]:
+    """Return what the compiled code takes of each pose."""
+    everywhere = fill_up(np.asarray(field, problem.dtype), problem.bucket)
+    return [
+        (
+            problem.system,
+            as_known(problem, targets, end),
+            fill_up(seen, problem.bucket),
+            everywhere,
         )
         for targets, end, seen in zip(poses.targets, ends, poses.counted, strict=True)
     ]
-    modes = np.asarray(each, np.float64)
-    modes = modes.reshape(len(each), 3, whole, -1)[:, :, : problem.n_vertices]
-    modes = np.swapaxes(modes, 1, 2).reshape(len(each), 3 * problem.n_vertices, -1)
-    basis, size, _ = np.linalg.svd(modes, full_matrices=False)
-    return HandleNoise(basis, relative * size)
 
 
-@quick_jit(static=("count", "solver", "adjoints"))
-def _modes(
-    system: System, known: Known, counted, field, count: int, solver, adjoints
-) -> Float[Array, "coordinates modes"]:
-    """Return U with U U^T nearly D D^T, for one pose.
-
-    A randomised range finder (Halko, Martinsson and Tropp 2011): D^T of random vectors spans the
-    motions of the handles that move the free vertices most. ``adjoints`` are those of finding and
-    of measuring.
-    """
-
-    def run(adjoint, targets):
-        positions = pose(system, known._replace(targets=targets), field, solver, adjoint)
-        return jnp.where(counted[None], positions, 0.0)
-
-    find, measure = (partial(run, adjoint) for adjoint in adjoints)
-    positions, pull = jax.vjp(find, known.targets)
-    push = lambda along: jax.jvp(measure, (known.targets,), (along,))[1]  # noqa: E731
+@quick_jit(static=("count", "solver", "adjoint"))
+def _motions(
+    system: System, known: Known, counted, field, count: int, solver, adjoint
+) -> Float[Array, "count 3 vertices"]:
+    """Return motions of the handles that move the free vertices most, orthonormal."""
+    run = partial(_positions, system, known, counted, field, solver, adjoint)
+    positions, pull = jax.vjp(run, known.targets)
     probes = jax.random.normal(jax.random.key(0), (count, *positions.shape), positions.dtype)
     (rows,) = jax.vmap(pull)(probes)
     basis, _ = jnp.linalg.qr(rows.reshape(count, -1).T)
-    moved = jax.vmap(push)(basis.T.reshape(count, *known.targets.shape))
-    return moved.reshape(count, -1).T
+    return basis.T.reshape(count, *known.targets.shape)
+
+
+@quick_jit(static=("solver", "adjoint"))
+def _moved(
+    system: System, known: Known, counted, field, motions, solver, adjoint
+) -> Float[Array, "motions 3 vertices"]:
+    run = partial(_positions, system, known, counted, field, solver, adjoint)
+    return jax.vmap(lambda along: jax.jvp(run, (known.targets,), (along,))[1])(motions)
+
+
+def _positions(system: System, known: Known, counted, field, solver, adjoint, targets):
+    positions = pose(system, known._replace(targets=targets), field, solver, adjoint)
+    return jnp.where(counted[None], positions, 0.0)

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 # Of the robust standard deviation (from the median of absolute deviations).
 _FAR = 6.0
 # More than this fraction of the vertices are no outliers: then the model is wrong, or the noise.
-_MANY = 0.1
+MANY = 0.1
 # As many neighbours are asked, and at least so many must have been seen.
 _ASKED, _FEWEST = 12, 3
 
@@ -34,7 +34,7 @@ def find_outliers(
         off = np.abs(residual[pose, enough] - np.nanmedian(around[enough], axis=1))
         deviation = 1.4826 * np.median(off)
         found[pose, enough] = (off > max(_FAR * deviation, floor)).any(axis=1)
-    return found if found.sum() <= _MANY * counted.sum() else np.zeros_like(found)
+    return found
 
 
 def _neighbours(edges, n: int) -> Int[np.ndarray, "vertices asked"]:

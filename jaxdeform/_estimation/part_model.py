@@ -103,8 +103,7 @@ class PartModel:
         ends = derivatives.ends
         return Fit(theta, vertices, jacobian, residual, error, ends, noise, triangle)
 
-    def positions(self, theta: np.ndarray) -> Float[np.ndarray, "poses vertices 3"]:
+    def ends(self, theta: np.ndarray) -> list[State]:
         """Deform into all poses, without derivatives."""
         field = self.field(theta).astype(self.problem.dtype)
-        ends = states(self.problem, self.poses, field, self.solver, self.adjoint)
-        return np.stack([np.asarray(end.vertices) for end in ends])
+        return states(self.problem, self.poses, field, self.solver, self.adjoint)

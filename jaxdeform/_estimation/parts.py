@@ -22,7 +22,7 @@ from jaxdeform._estimation.discrepancy import LEVEL, describe, f_test
 from jaxdeform._estimation.estimate import Estimate
 from jaxdeform._estimation.intervals import extremes, has_settled, linear_spread, log_intervals
 from jaxdeform._estimation.noise import HandleNoise, find_handle_noise
-from jaxdeform._estimation.outliers import find_outliers
+from jaxdeform._estimation.outliers import MANY, find_outliers
 from jaxdeform._estimation.part_model import Fit, PartModel
 from jaxdeform._estimation.poses import check_poses, same_length, without
 from jaxdeform._estimation.search import Found, search
@@ -198,14 +198,20 @@ class _Search:
         return search(evaluate, first, solver, left)
 
     def _without_outliers(self, best: Fit, result: Result):
-        floor = _MISPLACED * self.model.problem.mesh.diagonal
+        whole, first = self.model, (best, result)
+        mesh = whole.problem.mesh
         for _ in range(_OUTLIER_ROUNDS):
-            model = self.model
-            edges = model.problem.mesh.edges
-            far = find_outliers(edges, best.residual, model.poses.counted, floor)
+            poses = self.model.poses
+            far = find_outliers(
+                mesh.edges, best.residual, poses.counted, _MISPLACED * mesh.diagonal
+            )
             if not far.any() or not succeeded(result) or len(self.history) >= self.limit:
                 break
-            self.model = replace(model, poses=without(model.problem, model.poses, far))
+            left = poses.counted & ~far
+            if np.sum(whole.poses.counted & ~left) > MANY * np.sum(whole.poses.counted):
+                self.model = whole
+                return first
+            self.model = replace(whole, poses=without(whole.problem, poses, far))
             best, result = self.descend(self.evaluate(best.theta, best.noise))
         return best, result
 
@@ -223,6 +229,7 @@ def _judge(found: _Found, counted: np.ndarray, factor: float) -> Estimate:
         else:
             result = Result.unsettled
     reach = extremes(model, best)
+    ends[~reach.felt] = -np.inf, np.inf
     misfit, solver_error = map(poses.root_mean_square, (best.residual, best.solver_error))
     p_value = 1.0 if is_exact(model, best) else found.p_value
     discrepancy = describe(

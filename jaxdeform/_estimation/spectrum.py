@@ -5,7 +5,7 @@ the residual is smooth instead, and that interval covers the truth in 3 to 27 % 
 of 95. Here the variance of the residual is measured pattern by pattern, from the smoothest on (a
 spectrum), and the covariance of the estimate follows from it: A (sum_k v_k J_k^T J_k) A with
 A = (J^T J)^-1, a sandwich. With independent noise the intervals are hardly wider than the
-textbook's; with smooth errors they cover in 90 to 97 % (docs/estimation.md).
+textbook's; with smooth errors they cover in 90 to 97 % (docs/estimation-measured.md).
 
 Tried and worse: a Gaussian process with generalised least squares (covers in 11 %: it trusts the
 patterns of little noise, where it extrapolates), clusters and block bootstrap (7 %), an effective

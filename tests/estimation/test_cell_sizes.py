@@ -28,6 +28,7 @@ def test_the_sizes_of_two_parts(bar, noise):
     found = jd.estimate_rings(problem, pose, parts=upper, targets=targets)
     assert found.rings.tolist() == [2, 1]
     assert found.ok
+    assert found.explain().startswith("rings of the parts: 2, 1 (of ")
     np.testing.assert_allclose(found.fit.rigidity, [0.5, 30.0], rtol=0.1 if noise else 1e-3)
     assert found.problem.cells.membership.nnz == jd.rings(bar, sizes).membership.nnz
     alone = jd.estimate_rigidity(problem, pose, parts=upper, targets=targets)

@@ -14,9 +14,11 @@ from scipy.stats import multivariate_normal
 import jaxdeform as jd
 from jaxdeform._estimation.evidence import (
     Evidence,
+    Patterns,
     deviations,
     find_patterns,
     most_probable,
+    patch_deviations,
     with_noise,
 )
 from jaxdeform._estimation.field_prior import FLAT, Prior, Solve, WithPrior
@@ -192,6 +194,22 @@ def test_the_weight_and_the_noise_behind_the_poses_are_found(exact_problem):
     weights, noises = np.array(found).T
     assert abs(np.median(np.log(weights / 3.0))) < 0.7
     np.testing.assert_allclose(np.median(noises), 0.1, rtol=0.15)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.3])
+def test_the_patch_is_told_by_least_squares(exact_problem, radius):
+    """One change of all vertices within the radius, against dense algebra; 3,000 draws for 48."""
+    n, draw = exact_problem.n_vertices, np.random.default_rng(0)
+    points = exact_problem.vertices / exact_problem.mesh.diagonal
+    matrix = draw.standard_normal((30, n)) * np.geomspace(1.0, 1e-3, n)
+    pulls = draw.standard_normal((3000, 30)) @ matrix
+    patterns = Patterns(np.zeros((n, 1)), np.ones(1), np.ones(1), 1.0, pulls)
+    near = np.linalg.norm(points[:, None] - points, axis=2) <= radius
+    exact = 0.1 / np.linalg.norm(matrix @ near.T, axis=0)
+    found = patch_deviations(patterns, points, radius, 0.1)
+    np.testing.assert_allclose(found, exact, rtol=0.1)
+    unseen = patterns._replace(pulls=np.zeros_like(pulls))
+    assert np.isinf(patch_deviations(unseen, points, radius, 0.1)).all()
 
 
 # ---------------------------------------------------------------- fields recovered

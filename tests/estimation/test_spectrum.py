@@ -6,7 +6,7 @@ from helpers import EXACT, bumpy_sheet
 from scipy import stats
 
 from jaxdeform._estimation.discrepancy import LEVEL, describe, f_test
-from jaxdeform._estimation.outliers import find_outliers
+from jaxdeform._estimation.outliers import MANY, find_outliers
 from jaxdeform._estimation.smooth_modes import smooth_modes
 from jaxdeform._estimation.spectrum import spread
 
@@ -87,7 +87,7 @@ def test_independent_noise_is_covered_as_often_as_promised():
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [0.1, 0.3, 1.0])
 def test_smooth_errors_are_covered_where_the_textbook_fails(length):
-    """A wrong model leaves such a residual. 400 draws; 0.9 is what docs/estimation.md promises."""
+    """A wrong model leaves such a residual. 400 draws; the docs promise 0.9."""
     assert coverage(lambda draw: smooth_noise(draw, length), 400).min() > 0.88
     inverse = np.sqrt(np.diag(np.linalg.inv(MATRIX.T @ MATRIX)))
     hits = np.zeros(2)
@@ -183,10 +183,10 @@ def test_outliers_are_found_in_noise_and_smooth_errors():
         assert np.flatnonzero(found[0]).tolist() == [10, 33]
 
 
-def test_what_is_wrong_everywhere_is_no_outlier():
+def test_what_is_wrong_everywhere_is_too_much():
     mesh = bumpy_sheet()
     residual = np.random.default_rng(0).standard_cauchy((1, 56, 3))
-    assert not find_outliers(mesh.edges, residual, np.ones((1, 56), bool), 1e-6).any()
+    assert find_outliers(mesh.edges, residual, np.ones((1, 56), bool), 1e-6).mean() > MANY
 
 
 def test_deviations_below_the_floor_are_none():
