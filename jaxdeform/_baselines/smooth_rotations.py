@@ -74,10 +74,8 @@ class SmoothEnergy(NamedTuple):
 
     def pull(self, t: Float[Array, "3 3 v"]) -> Float[Array, "3 3 v"]:
         """Return ``sum_j a_ij (R_j + R_i)``: a symmetric and semidefinite map of R."""
-        axes = self.system.principal_axes
-        world = jnp.einsum("aik,jik->ajk", t, axes, precision="highest")
-        world = self.coupling.apply(world)
-        return jnp.einsum("ajk,jik->aik", world, axes, precision="highest")
+        world = self.coupling.apply(self.system.out_of_axes(t))
+        return self.system.into_axes(world)
 
     def value(
         self, p: Float[Array, "3 v"], t: Float[Array, "3 3 v"], pull: Float[Array, "3 3 v"]

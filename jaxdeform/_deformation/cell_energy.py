@@ -14,6 +14,7 @@ from jaxdeform._linalg.small_matrices import (
     Matrices,
     Scalars,
     Vectors,
+    inner,
     minus_identity,
     product,
     product_of_arrays,
@@ -30,15 +31,17 @@ def cell_energy(t, c, b, lam):
 
 def cell_energies(t: Matrices, c: Matrices, b: Vectors, rigidity: Scalars) -> Scalars:
     """Eq. 4.2 for all cells (the last axis): ``lambda |T^T T - I|^2 + tr(T B T^T) - 2 tr(T C)``."""
-    gram = [[_dot(t[:, i], t[:, j]) for j in range(i + 1)] for i in range(3)]
+    gram = [[inner(t[:, i], t[:, j]) for j in range(i + 1)] for i in range(3)]
     stretch = sum((gram[i][i] - 1.0) ** 2 for i in range(3))
     shear = sum(gram[i][j] ** 2 for i in range(3) for j in range(i))
-    data = sum(b[i] * gram[i][i] - 2.0 * _dot(t[:, i], c[i]) for i in range(3))
+    data = sum(b[i] * gram[i][i] - 2.0 * inner(t[:, i], c[i]) for i in range(3))
     return rigidity * (stretch + 2.0 * shear) + data
 
 
-def _dot(u: Vectors, v: Vectors) -> Scalars:
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+def cell_sizes(b: Vectors, rigidity: Scalars) -> Scalars:
+    """Return the size of the coefficients of each cell; 1 where all are 0."""
+    size = rigidity + jnp.max(jnp.abs(b), axis=0)
+    return jnp.where(size > 0, size, 1.0)
 
 
 def half_gradient(x: Grid, m: Grid, b: list[Array], lam: Array) -> Grid:
@@ -65,7 +68,7 @@ def half_hessian(t: Matrices, b: Vectors, lam: Scalars) -> Blocks:
     twice = 2.0 * lam[None, None]
 
     def block(i: int, k: int) -> Matrices:
-        strain = _dot(t[i], t[k])[None, None] * unit + t[k, :, None] * t[i, None]
+        strain = inner(t[i], t[k])[None, None] * unit + t[k, :, None] * t[i, None]
         if i != k:
             return twice * strain
         return twice * (strain + gram - unit) + unit * b[None]

@@ -258,7 +258,7 @@ def _bring_back(
     """Return the positions that fit the transformations of the coarse cells: one global step."""
     transforms = jnp.where(jnp.isnan(transforms), jnp.eye(3, dtype=transforms.dtype), transforms)
     t = jnp.einsum("nv,nvji->jiv", share, transforms[nearest], precision="highest")
-    t = jnp.einsum("jiv,iav->jav", t, system.principal_axes, precision="highest")
+    t = system.into_axes(t)
     p = jnp.where(system.free[None], system.rest, inputs.targets)
     pull = system.covariance.transpose(t) + inputs.soft[None] * inputs.targets
     gradient = jnp.where(system.free[None], system.stiffness.apply(p) - pull, 0.0)

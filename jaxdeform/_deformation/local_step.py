@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdeform._checks import check_count, check_tolerance
-from jaxdeform._deformation.cell_energy import cell_energies, cell_energy
+from jaxdeform._deformation.cell_energy import cell_energies, cell_energy, cell_sizes
 from jaxdeform._deformation.cell_newton import block_newton, exact_newton, gradient_tolerance
 from jaxdeform._deformation.material_derivative import material_with_derivative
 from jaxdeform._linalg.batching import as_member
@@ -142,7 +142,7 @@ class Newton(_Material):
         m = product(as_grid(c), rotation)
         m = [[m[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]  # C R = U S U^T
         # Squares of these numbers leave the range of float32 for meshes 1e10 long.
-        size = _size(b, rigidity)
+        size = cell_sizes(b, rigidity)
         m = [[v / size for v in row] for row in m]
         b, rigidity = b / size[None], rigidity / size
         data = m, list(b), rigidity, gradient_tolerance(m, rigidity)
@@ -322,13 +322,8 @@ class AffineFit:
 
 def _scaled(c: Matrices, b: Vectors, rigidity: Scalars) -> tuple[Matrices, Vectors, Scalars]:
     """Divide each cell's problem by its size, so that one tolerance fits all."""
-    size = _size(b, rigidity)
+    size = cell_sizes(b, rigidity)
     return c / size[None, None], b / size[None], rigidity / size
-
-
-def _size(b: Vectors, rigidity: Scalars) -> Scalars:
-    size = rigidity + jnp.max(jnp.abs(b), axis=0)
-    return jnp.where(size > 0, size, 1.0)
 
 
 def _energy_rounding(c, b, lam):

@@ -6,7 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdeform._deformation.cell_energy import half_gradient, half_hessian, half_hessian_product
+from jaxdeform._deformation.cell_energy import (
+    cell_sizes,
+    half_gradient,
+    half_hessian,
+    half_hessian_product,
+)
 from jaxdeform._linalg.block_factor import BlockFactor
 from jaxdeform._linalg.known_value import with_derivative_of
 from jaxdeform._linalg.small_matrices import (
@@ -77,8 +82,7 @@ class _Hessian(NamedTuple):
     def at(t: Matrices, b: Vectors, rigidity: Scalars) -> "_Hessian":
         """Factor H; directions without stiffness get a floor."""
         t, b, rigidity = jax.lax.stop_gradient((t, b, rigidity))
-        scale = rigidity + jnp.max(jnp.abs(b), axis=0)
-        scale = jnp.where(scale > 0, scale, 1.0)
+        scale = cell_sizes(b, rigidity)
         floor = jnp.full_like(scale, jnp.finfo(t.dtype).eps)
         factor = BlockFactor.of(half_hessian(t, b / scale[None], rigidity / scale), floor)
         return _Hessian((as_grid(t), list(b), rigidity), factor, scale)

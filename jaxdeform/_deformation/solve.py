@@ -218,7 +218,7 @@ def _energy(
     t: Float[Array, "3 3 vertices"],
     lam: Float[Array, "vertices"],
 ) -> Float[Array, ""]:
-    t = jnp.einsum("aik,ijk->ajk", t, system.principal_axes, precision="highest")
+    t = system.into_axes(t)
     stiff = system.stiffness.apply(p) - system.soft[None] * p
     cells = cell_energies(t, system.covariance(p), system.principal_moments, lam)
     return jnp.sum(p * stiff) + jnp.sum(cells)
@@ -286,9 +286,7 @@ def solution_of(system: System, inputs: Inputs, end: Descent, value: Float[Array
     after = jnp.arange(end.energy.shape[0], dtype=end.steps.dtype) >= end.steps
     return Solution(
         vertices=(end.positions + system.center[:, None]).T,
-        transforms=jnp.einsum(
-            "aik,jik->kaj", end.transforms, system.principal_axes, precision="highest"
-        ),
+        transforms=jnp.moveaxis(system.out_of_axes(end.transforms), -1, 0),
         energy=jnp.where(after, value, end.energy),
         steps=end.steps,
         result=outcome_of(*jax.lax.stop_gradient((system, inputs, end))),

@@ -63,6 +63,14 @@ class System(eqx.Module):
         """True where the first guess is given: at fixed vertices and soft handles."""
         return ~self.free | (self.soft > 0)
 
+    def into_axes(self, t: Float[Array, "3 3 vertices"]) -> Float[Array, "3 3 vertices"]:
+        """Return transformations of world axes as those of the principal axes of the cells."""
+        return jnp.einsum("aik,ijk->ajk", t, self.principal_axes, precision="highest")
+
+    def out_of_axes(self, t: Float[Array, "3 3 vertices"]) -> Float[Array, "3 3 vertices"]:
+        """Return transformations of the principal axes of the cells as those of world axes."""
+        return jnp.einsum("aik,jik->ajk", t, self.principal_axes, precision="highest")
+
     def at_fixed(self, x: Float[Array, "3 vertices"]) -> Float[Array, "3 vertices"]:
         """Return x at the vertices that are not free, 0 elsewhere.
 

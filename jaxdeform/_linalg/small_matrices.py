@@ -43,7 +43,7 @@ def minus_identity(x: Grid) -> Grid:
     return [[x[i][j] - 1.0 if i == j else x[i][j] for j in range(3)] for i in range(3)]
 
 
-def inner(u: list[Array], v: list[Array]) -> Array:
+def inner(u: list[Array] | Vectors, v: list[Array] | Vectors) -> Array:
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
