@@ -254,6 +254,12 @@ def _told(path: jd.Solution, frames: int) -> Iterator[str]:
     if flipped.any():
         which = np.flatnonzero(flipped).tolist()
         yield f"{len(which)} of {frames} frames ({_numbers(which)}) have cells inside out"
+    for k in np.flatnonzero(path.jumped):
+        before, after = (f"{float(path.energy[j, -1]):.4g}" for j in (k - 1, k))
+        yield (
+            f"frame {k + 1}: the shape jumped to another equilibrium (energy {before} to {after}): "
+            "a part of the motion may be lost"
+        )
 
 
 def _numbers(frames: list[int]) -> str:

@@ -50,6 +50,7 @@ class Solution(eqx.Module):
     - result: what happened, a member of `Result`.
     - flipped: (*batch,) number of cells that are inside out (det T <= 0): a part of the mesh is its
       mirror image.
+    - jumped: (*batch,) of a frame of `deform_path`: the shape jumped to another equilibrium.
     """
 
     vertices: Float[Array, "*batch vertices 3"]
@@ -58,6 +59,7 @@ class Solution(eqx.Module):
     steps: Int[Array, "*batch"]
     result: Result
     flipped: Int[Array, "*batch"]
+    jumped: Bool[Array, "*batch"]
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:
@@ -84,7 +86,7 @@ class Solution(eqx.Module):
         for what, bad in (("at fault", ~finite), ("inside out (det T <= 0)", flipped)):
             at = np.flatnonzero(bad)
             text += f" Cells {what}: {first_few(at)} ({len(at)} of {len(t)})." if at.size else ""
-        return text
+        return text + (" The shape jumped to another equilibrium." if self.jumped else "")
 
 
 def deform(
@@ -291,6 +293,7 @@ def solution_of(system: System, inputs: Inputs, end: Descent, value: Float[Array
         steps=end.steps,
         result=outcome_of(*jax.lax.stop_gradient((system, inputs, end))),
         flipped=inside_out(jax.lax.stop_gradient(end.transforms)),
+        jumped=as_varying(jnp.zeros((), bool), end.steps),
     )
 
 

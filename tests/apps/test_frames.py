@@ -20,6 +20,7 @@ def deform(run, monkeypatch, tmp_path):
 
 
 WHERE = "--fix", "y<0.1", "--move", "y>0.9"
+TURN = range(10, 361, 10)
 MOTION = "--rotate", "y", 300, "--translate", 0.1, 0.2, 0
 
 
@@ -162,3 +163,24 @@ def test_frames_that_stop_early_or_turn_inside_out_are_counted(deform, monkeypat
     assert "7 of 7 frames (1, 2, 3, 4, 5, ...): Stopped at the step limit" in out
     assert "frames (" in out.split("Stopped")[1]
     assert "have cells inside out" in out
+
+
+@pytest.mark.slow
+def test_a_jump_is_told_with_its_energies(deform):
+    motion = "--rotate", "y", 360, "--frames", 36, "--rigidity", 1e-3
+    code, out, err = deform(*WHERE, *motion, "-o", "out.obj")
+    assert (code, err) == (0, "")
+    told = [line for line in out.splitlines() if "the shape jumped" in line]
+    assert told
+    mesh, handles, _ = moved_by(0.0)
+    points = mesh.vertices[handles]
+    up = points[:, 1] > 0.9
+    targets = np.stack(
+        [np.where(up[:, None], jd.rotate(points, a, axis="y"), points) for a in TURN]
+    )
+    want = jd.deform_path(jd.precompute(mesh, handles), targets, 1e-3)
+    first = int(np.argmax(want.jumped))
+    before, after = (f"{float(want.energy[k, -1]):.4g}" for k in (first - 1, first))
+    assert told[0].startswith(f"frame {first + 1}: the shape jumped to another equilibrium")
+    assert f"(energy {before} to {after})" in told[0]
+    assert len(told) == int(np.sum(want.jumped))

@@ -48,6 +48,7 @@ def test_a_full_turn_is_not_the_rest_shape(bar, turn):
     assert out.ok.shape == (24,)
     assert np.all(out.ok)
     assert not np.any(out.flipped)
+    assert not np.any(out.jumped)
     np.testing.assert_allclose(targets[-1], bar.vertices[problem.handles], atol=EXACT)
     np.testing.assert_allclose(out.vertices[:, problem.handles], targets, atol=EXACT)
     last = np.asarray(out.energy)[:, -1]
@@ -205,6 +206,7 @@ def test_what_does_not_resist_passes_through_itself(bar, bar_problem, frames):
     assert np.all(out.ok)
     assert np.all(np.diff(energy[: frames // 2]) > 0)
     assert energy.argmax() < frames - 1
+    assert np.any(out.jumped)
     np.testing.assert_allclose(out.vertices[-1], bar.vertices, atol=1e-2)
 
 
