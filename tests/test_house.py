@@ -38,6 +38,7 @@ FLOORS = [
     ["_estimation"],
     ["_plotting"],
     ["_apps"],
+    ["__main__"],
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 
@@ -149,6 +150,8 @@ def test_files_and_functions_stay_small(name):
 
 def test_public_names_are_sorted_and_there():
     assert len(set(jd.__all__)) == len(jd.__all__)
+    for module in (jd, jd.select, jd.shapes):
+        assert dir(module) == sorted(module.__all__)
     public = {
         name
         for name, thing in vars(jd).items()

@@ -27,6 +27,11 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    """Return what tab completion offers: no helpers."""
+    return __all__
+
+
 def where(mesh: Mesh, expression: str) -> Selection:
     """Select the vertices where an expression of their coordinates holds.
 

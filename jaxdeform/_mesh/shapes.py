@@ -8,6 +8,11 @@ from jaxdeform._mesh.mesh import Mesh
 __all__ = ["bar", "cactus", "cylinder", "octopus", "square"]
 
 
+def __dir__() -> list[str]:
+    """Return what tab completion offers: no helpers."""
+    return __all__
+
+
 def bar() -> Mesh:
     """Return the thesis's bar (Table 5.1): 722 vertices, 1440 faces, 30 x 151 x 30, along y.
 

@@ -385,3 +385,16 @@ def test_what_stl_cannot_hold_is_refused_before_the_work_and_rescued_after(run, 
     assert "bent.stl: not written: STL keeps single" in err
     assert err.endswith(f"; the result is in {files}/bent.rescued.ply\n")
     assert jd.load_mesh(files / "bent.rescued.ply").n_vertices == 722
+
+
+def test_the_package_runs_as_a_module(tmp_path, bar):
+    jd.save_mesh(tmp_path / "bar.off", bar)
+    command = [sys.executable, "-m", "jaxdeform", "inspect"]
+    done = subprocess.run(
+        [*command, tmp_path / "bar.off"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("vertices")
+    assert "722" in done.stdout.splitlines()[0]
+    failed = subprocess.run([*command, "none.off"], capture_output=True, text=True, check=False)
+    assert failed.returncode == 2
+    assert failed.stderr.startswith("jaxdeform: none.off: cannot be read")
