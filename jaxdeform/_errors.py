@@ -48,6 +48,11 @@ def have(name: str) -> str:
     return "have" if name.endswith("s") else "has"
 
 
+def number_of(count: int, one: str, many: str) -> str:
+    """Return the count and its noun, that of one or that of many."""
+    return f"{count} {one if count == 1 else many}"
+
+
 def a_or_an(value: Any) -> str:
     """Return the type of a value, with its article."""
     if value is None:

@@ -13,7 +13,7 @@ import jaxdeform as jd
 from jaxdeform._apps.arguments import choose_parts, read_pose
 from jaxdeform._apps.results import as_json, save_result
 from jaxdeform._apps.talk import console, patiently, say_wrote, since
-from jaxdeform._errors import printable
+from jaxdeform._errors import number_of, printable
 from jaxdeform._estimation.found_handles import FoundHandles, search_handles
 from jaxdeform._estimation.held_out import prediction_errors
 from jaxdeform._mesh.files import check_output, format_of, without_suffix
@@ -232,7 +232,7 @@ def _moved_rigidly(mesh: jd.Mesh, observed: np.ndarray, tolerance: float | None)
     found = patiently("finding handles", lambda: search_handles(mesh, observed, tolerance))
     sizes = ", ".join(str(len(group.vertices)) for group in found.groups[:10])
     more = ", ..." if len(found.groups) > 10 else ""
-    count = "1 group" if len(found.groups) == 1 else f"{len(found.groups)} groups"
+    count = number_of(len(found.groups), "group", "groups")
     console.print(
         f"handles: {count} of vertices moved rigidly ({sizes}{more}), within "
         f"{found.tolerance:.2g} of the diagonal"

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import jaxdeform as jd
+from jaxdeform._errors import number_of
 from jaxdeform._mesh.select import some_where
 
 
@@ -69,7 +70,10 @@ class Moves(NamedTuple):
     def __str__(self) -> str:
         """Return how many vertices were chosen."""
         moved = int(self.moved.sum())
-        return f"fixed: {len(self.moved) - moved} vertices, moved: {moved} vertices"
+        fixed, moved = (
+            number_of(n, "vertex", "vertices") for n in (len(self.moved) - moved, moved)
+        )
+        return f"fixed: {fixed}, moved: {moved}"
 
     def path(self, frames: int) -> Float[np.ndarray, "frames handles 3"]:
         """Return the targets in even steps; the last ones are ``targets``.
@@ -105,8 +109,8 @@ def moves_by_place(mesh: jd.Mesh, fix: list[str], move: str | None, motion: Moti
     both = fixed & moved
     if len(both):
         raise jd.InputError(
-            f"--fix and --move both choose {len(both)} vertices (vertex {both.vertices[0]}): let "
-            "one of them leave these out"
+            f"--fix and --move both choose {number_of(len(both), 'vertex', 'vertices')} (vertex "
+            f"{both.vertices[0]}): let one of them leave out what the other has"
         )
     handles = (fixed | moved).vertices
     grabbed = moved.mask[handles]
@@ -114,7 +118,9 @@ def moves_by_place(mesh: jd.Mesh, fix: list[str], move: str | None, motion: Moti
     targets[grabbed] = motion.of(targets[grabbed])
     if motion.turns_in_place(mesh.vertices[handles[grabbed]], mesh.diagonal):
         raise jd.InputError(
-            f"--rotate: the {int(grabbed.sum())} vertices of --move lie on the axis, which goes "
-            "through their middle, so nothing moves: give --about X Y Z, or choose more vertices"
+            "--rotate: the "
+            + number_of(int(grabbed.sum()), "vertex of --move lies", "vertices of --move lie")
+            + " on the axis, which goes through the middle, so nothing moves: give --about X Y "
+            "Z, or choose more vertices"
         )
     return Moves(handles, mesh.vertices[handles], targets, grabbed, motion)

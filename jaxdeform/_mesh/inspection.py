@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxdeform._checks import read_path
-from jaxdeform._errors import ArrayLike, InputError, a_or_an
+from jaxdeform._errors import ArrayLike, InputError, a_or_an, number_of
 from jaxdeform._mesh.files import read_arrays
 from jaxdeform._mesh.mesh import (
     NO_AREA,
@@ -107,18 +107,21 @@ def inspect(mesh: MeshLike) -> Inspection:
     vertices, faces, source = _arrays(mesh)
     findings: list[str] = []
 
-    def report(count: int, what: str, move: str) -> None:
+    def report(count: int, subject: str, rest: str, move: str) -> None:
+        """Note a finding; the subject is that of one and that of many, with a bar between."""
         if count:
-            findings.append(f"{count} {what}: {move}")
+            findings.append(f"{number_of(count, *subject.split('|'))}{rest}: {move}")
 
     if source:
         polygons = int((source.polygons.sizes > 3).sum())
         report(
             polygons,
-            "faces have more than three corners",
-            "cut into triangles for the work, kept as they are in a file of the same mesh",
+            "face has|faces have",
+            " more than three corners",
+            "cut into triangles for the work, kept whole in a file of the same mesh",
         )
-        report(source.trailing, "bytes follow the end of the mesh", "they are not read")
+        trailing = "byte follows|bytes follow"
+        report(source.trailing, trailing, " the end of the mesh", "not read")
     try:
         points, faces = checked_arrays(vertices, faces)
     except InputError as error:
@@ -127,25 +130,31 @@ def inspect(mesh: MeshLike) -> Inspection:
     bad = degenerate_faces(points, faces)
     repeating = [k for reason, k in bad if reason != NO_AREA]
     flat = [k for reason, k in bad if reason == NO_AREA]
-    remedy = "jd.repair drops them"
-    report(len(repeating), f"faces repeat a vertex (face {(repeating or [0])[0]})", remedy)
+    remedy = "jd.repair drops such faces"
+    repeat = f" a vertex (face {(repeating or [0])[0]})"
+    report(len(repeating), "face repeats|faces repeat", repeat, remedy)
     report(
         len(flat),
-        f"faces have no area (face {(flat or [0])[0]})",
-        f"their edges weigh nothing; {remedy}",
+        "face has|faces have",
+        f" no area (face {(flat or [0])[0]})",
+        f"edges weigh nothing there; {remedy}",
     )
     sound = np.delete(faces, [k for _, k in bad], axis=0)
     sound = sound[np.unique(np.sort(sound, axis=1), axis=0, return_index=True)[1]]
     unreferenced = n - len(np.unique(np.delete(faces, flat, axis=0)))
-    report(unreferenced, "vertices belong to no face with an area", "they stay where they are")
+    report(
+        unreferenced, "vertex belongs|vertices belong", " to no face with an area", "left in place"
+    )
     duplicates = n - len(np.unique(points, axis=0))
     report(
         duplicates,
-        "vertices lie exactly on another",
+        "vertex lies|vertices lie",
+        " exactly on another",
         "the mesh is not joined there; jd.repair merges",
     )
     repeated = m - len(np.unique(np.sort(faces, axis=1), axis=0))
-    report(repeated, "faces are repeated", "their edges weigh double; jd.repair drops them")
+    double = "edges weigh double there; jd.repair drops repeats"
+    report(repeated, "face is|faces are", " repeated", double)
     counts: dict[str, int | float] = {"vertices": n, "faces": m}
     if len(sound):
         with np.errstate(all="ignore"):  # numbers near the ends of the range of float64
@@ -162,7 +171,8 @@ def _inspect_structure(points, faces, counts, report) -> None:
     used = np.unique(faces)
     components = len(np.unique(label[used]))
     counts["components"] = components
-    report(components - 1, "further connected components", "each needs a handle of its own")
+    further = "further connected component|further connected components"
+    report(components - 1, further, "", "each needs a handle of its own")
 
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     pairs, inverse, times = np.unique(
@@ -171,11 +181,14 @@ def _inspect_structure(points, faces, counts, report) -> None:
     border, crowded = int((times == 1).sum()), int((times > 2).sum())
     counts["border edges"] = border
     counts["Euler characteristic"] = len(used) - len(pairs) + len(faces)
-    report(border, "edges lie on the border", "the surface is open there, which is allowed")
-    report(crowded, "edges have more than two faces", "non-manifold, which is allowed")
+    open_there = "the surface is open there, which is allowed"
+    report(border, "edge lies|edges lie", " on the border", open_there)
+    many_faces = " more than two faces"
+    report(crowded, "edge has|edges have", many_faces, "non-manifold, which is allowed")
     report(
         int((_fans(faces, inverse.ravel()) > 1).sum()),
-        "vertices join surfaces that meet nowhere else",
+        "vertex joins|vertices join",
+        " surfaces that meet nowhere else",
         "non-manifold, which is allowed",
     )
     ascending = np.where(directed[:, 0] < directed[:, 1], 1, -1)
@@ -183,7 +196,8 @@ def _inspect_structure(points, faces, counts, report) -> None:
     clash = int(((times == 2) & (twist != 0)).sum())
     report(
         clash,
-        "edges have faces of opposite orientation",
+        "edge has|edges have",
+        " faces of opposite orientation",
         "harmless: around each vertex one side is chosen",
     )
     center = points[used].mean(axis=0)
@@ -195,7 +209,10 @@ def _inspect_structure(points, faces, counts, report) -> None:
         k for k in np.unique(component) if k not in is_open and volume[component == k].sum() < 0
     ]
     report(
-        len(inward), "closed components face inwards", "harmless: normals rotate with the surface"
+        len(inward),
+        "closed component faces|closed components face",
+        " inwards",
+        "harmless: normals rotate with the surface",
     )
 
 
@@ -238,7 +255,11 @@ def _inspect_angles(points, faces, counts, report) -> None:
     weight = np.bincount(inverse.ravel(), cot.ravel()) / 2
     report(
         int((weight < -1e-9).sum()),
-        "edges have negative cotangent weights (obtuse angles)",
+        "edge has a negative cotangent weight|edges have negative cotangent weights",
+        " (obtuse angles)",
         "kept, but set to 0 in cells whose moments they make indefinite (see jd.rings)",
     )
-    report(int((angle < 1.0).sum()), "angles are below 1 degree", "expect slower convergence there")
+    below = " below 1 degree"
+    report(
+        int((angle < 1.0).sum()), "angle is|angles are", below, "expect slower convergence there"
+    )

@@ -94,7 +94,9 @@ def test_inspect(run, files):
     (files / "flat.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n")
     code, out, _ = run("inspect", files / "flat.off")
     assert code == 0
-    assert "1 faces have no area (face 0): their edges weigh nothing; jd.repair drops them" in out
+    assert (
+        "1 face has no area (face 0): edges weigh nothing there; jd.repair drops such faces" in out
+    )
     code, out, err = run("inspect", files / "none[b].off")
     assert (code, out) == (2, "")
     assert err == f"jaxdeform: {files}/none[b].off: cannot be read " + (

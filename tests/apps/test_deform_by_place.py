@@ -189,7 +189,8 @@ def test_a_rotation_of_what_lies_on_its_axis_is_refused(deform):
         for still in ([], ["--translate", 0, 0, 0]):
             code, _, err = deform("--fix", "y<0.1", "--move", chosen, "--rotate", "z", 60, *still)
             assert code == 2
-            assert "lie on the axis, which goes through their middle, so nothing moves" in err
+            assert "on the axis, which goes through the middle, so nothing moves" in err
+            assert ("the 1 vertex of --move lies on" in err) == (chosen == alone)
     code, _, err = deform(
         "--fix", "y<0.1", "--move", alone, "--rotate", "z", 60, "--about", 0, 0, 0, "--steps", 2
     )

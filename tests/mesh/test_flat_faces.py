@@ -69,9 +69,10 @@ def test_files_keep_them_and_inspect_tells_of_them(tmp_path, pair):
     assert back == mesh
     text = str(jd.inspect(back))
     assert (
-        "- 3 faces have no area (face 0): their edges weigh nothing; jd.repair drops them" in text
+        "- 3 faces have no area (face 0): edges weigh nothing there; jd.repair drops such faces"
+        in text
     )
-    assert "- 1 vertices belong to no face with an area: they stay where they are" in text
+    assert "- 1 vertex belongs to no face with an area: left in place" in text
     assert jd.repair(back)[0].n_faces == pair[0].n_faces
 
 

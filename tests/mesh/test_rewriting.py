@@ -277,7 +277,7 @@ def test_inspect_tells_of_polygons_and_of_bytes_behind_the_end(tmp_path):
     assert findings[0].startswith("2 faces have more than three corners: cut into triangles")
     assert jd.inspect(jd.load_mesh(CASES / "02_quads.obj")).findings == findings
     findings = jd.inspect(CASES / "47_binary_trailing_bytes.stl").findings
-    assert findings == ("3 bytes follow the end of the mesh: they are not read",)
+    assert findings == ("3 bytes follow the end of the mesh: not read",)
     for name in ("24_quad.off", "37_tristrips.ply"):
         (tmp_path / name).write_bytes((CASES / name).read_bytes() + b"more \n\n")
         assert "5 bytes follow the end" in " ".join(jd.inspect(tmp_path / name).findings)
