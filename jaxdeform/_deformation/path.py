@@ -206,7 +206,7 @@ def _slope(
     At a minimum it is the force on the handles, which the energy of the cells makes (without the
     pull of soft ones): ``2 (A p' - K^T T)``.
     """
-    t = jnp.einsum("kai,ijk->ajk", transforms, system.principal_axes, precision="highest")
+    t = system.into_axes(jnp.moveaxis(transforms, 0, -1))
     stiff = system.stiffness.apply(p) - system.soft[None] * p
     scale = jnp.abs(jnp.sum(p * stiff))
     return 2.0 * (stiff - system.covariance.transpose(t)), 1e2 * jnp.finfo(p.dtype).eps * scale
