@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxdeform as jd
-from jaxdeform._apps.batch.manifest import Job, read_manifest
+from jaxdeform._apps.batch.job import Job
+from jaxdeform._apps.batch.manifest import read_manifest
 
 pyarrow = pytest.importorskip("pyarrow")
 

@@ -12,7 +12,8 @@ import typer
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import make_folder
-from jaxdeform._apps.batch.manifest import Job, read_manifest
+from jaxdeform._apps.batch.job import Job
+from jaxdeform._apps.batch.manifest import read_manifest
 from jaxdeform._apps.talk import console, counted, patiently, since
 from jaxdeform._errors import printable
 

@@ -4,69 +4,16 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 import jaxdeform as jd
+from jaxdeform._apps.batch.columns import READERS
+from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.methods import Method
 from jaxdeform._errors import a_or_an, shown
-from jaxdeform._mesh.expressions import matching
 from jaxdeform._mesh.reading import read_bytes, read_text
-from jaxdeform._mesh.words import real
-
-# The results of a run are those of methods that have an energy.
-_METHODS = [str(method) for method in Method if method.has_energy]
-
-
-class Job(NamedTuple):
-    """One row: a deformation, or a fit where it has poses. Paths are absolute, None is blank."""
-
-    job: str
-    mesh: str
-    handles: str | None = None
-    fix: str | None = None
-    move: str | None = None
-    rotate: tuple[str, float] | None = None
-    about: tuple[float, ...] | None = None
-    translate: tuple[float, ...] | None = None
-    frames: int | None = None
-    method: str = "material"
-    rigidity: str | None = None
-    stiff: tuple[str, ...] = ()
-    rings: int = 1
-    poses: tuple[str, ...] = ()
-    alpha: float | None = None
-
-    @property
-    def problem(self) -> tuple[Any, ...]:
-        """What jobs of one factor have in common."""
-        spokes = Method(self.method).has_spokes
-        return self.mesh, self.handles, self.fix, self.move, self.rings, spokes
-
-    def as_json(self) -> str:
-        """Return the row as text, and nothing that is blank."""
-        values = {k: v for k, v in self._asdict().items() if v not in (None, ())}
-        return json.dumps(values)
-
-    @staticmethod
-    def of_json(text: str) -> "Job":
-        """Return what `as_json` wrote."""
-        read = json.loads(text)
-        values: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in read.items()
-        }
-        return Job(**values)
-
-    @property
-    def files(self) -> list[str]:
-        """The files that it reads."""
-        named = [self.mesh, self.handles, *self.poses]
-        if self.rigidity and _number(self.rigidity) is None:
-            named.append(self.rigidity)
-        return [name for name in named if name]
 
 
 def read_manifest(path: Path) -> list[Job]:
@@ -133,15 +80,15 @@ def _job(
     """Return a checked row. `read` has what the rows above it held, which is mostly the same."""
     values: dict[str, Any] = {"job": str(number)}
     for column, value in row.items():
-        if column not in _READERS:
-            columns = ", ".join(_READERS)
+        if column not in READERS:
+            columns = ", ".join(READERS)
             raise jd.InputError(f"{where}: {shown(column)} is no column: there are {columns}")
         blank = value is None or value == [] or (isinstance(value, str) and not value.strip())
         if not blank and not (isinstance(value, float) and math.isnan(value)):
             key = column, repr(value)
             if key not in read:
                 try:
-                    read[key] = _READERS[column](value, folder)
+                    read[key] = READERS[column](value, folder)
                 except jd.InputError as error:
                     raise jd.InputError(f"{where}, {column}: {error}") from error
             values[column] = read[key]
@@ -177,134 +124,3 @@ def _check_together(where: str, job: Job) -> None:
         raise jd.InputError(f"{where}: {job.method} has no rigidity: leave out rigidity and stiff")
     if job.method != Method.sr_arap and job.alpha is not None:
         raise jd.InputError(f"{where}: {job.method} has no alpha: leave it out")
-
-
-# ---------------------------------------------------------------- one reader a column
-
-
-def _name(value: Any, folder: Path) -> str:
-    name = str(value).strip()
-    if name in (".", "..") or set(name) & set('/\\:*?"<>|\0') or not name.isprintable():
-        raise jd.InputError(f"{shown(name)} cannot name a file: leave out signs such as / and :")
-    return name
-
-
-def _file(value: Any, folder: Path) -> str:
-    if not isinstance(value, str):
-        raise jd.InputError(f"is {a_or_an(value)}: give the name of a file")
-    try:
-        path = (folder / value.strip()).resolve()
-        found = path.is_file()
-    except (OSError, ValueError) as error:
-        raise jd.InputError(f"{shown(value)} is no name of a file ({error})") from error
-    if not path.is_relative_to(folder):
-        raise jd.InputError(
-            f"{shown(value)} is outside the manifest's folder: put it beside the manifest"
-        )
-    if not found:
-        raise jd.InputError(f"there is no file {path}: check the name")
-    return str(path)
-
-
-def _files(value: Any, folder: Path) -> tuple[str, ...]:
-    return tuple(_file(one, folder) for one in _listed(value, ";"))
-
-
-# A solid, on which every expression that can be read has a value.
-_SOLID = jd.Mesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-
-
-def _expression(value: Any, folder: Path) -> str:
-    matching(_SOLID, value, "the expression")
-    return value.strip()
-
-
-def _numbers(value: Any, count: int) -> tuple[float, ...]:
-    words = _listed(value, None)
-    numbers = [_number(word) for word in words]
-    if len(numbers) != count or None in numbers:
-        raise jd.InputError(f"{shown(value)}: give {count} numbers, such as 0 0.5 1")
-    return tuple(x for x in numbers if x is not None)
-
-
-def _point(value: Any, folder: Path) -> tuple[float, ...]:
-    return _numbers(value, 3)
-
-
-def _rotation(value: Any, folder: Path) -> tuple[str, float]:
-    words = _listed(value, None)
-    degrees = _number(words[-1]) if len(words) == 2 else None
-    if degrees is None or words[0] not in ("x", "y", "z"):
-        raise jd.InputError(f"{shown(value)}: give an axis and degrees, such as z 60")
-    return str(words[0]), degrees
-
-
-def _listed(value: Any, mark: str | None) -> list[Any]:
-    return value.split(mark) if isinstance(value, str) else list(np.atleast_1d(value).tolist())
-
-
-def _number(word: Any) -> float | None:
-    try:
-        number = real(str(word).strip().encode(errors="replace"))
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _count(value: Any, folder: Path) -> int:
-    number = None if isinstance(value, bool) else _number(value)
-    if number is None or number != int(number) or not 1 <= number <= 9999:
-        raise jd.InputError(f"{shown(value)}: give a whole number from 1 to 9999")
-    return int(number)
-
-
-def _method(value: Any, folder: Path) -> str:
-    if value not in _METHODS:
-        raise jd.InputError(f"{shown(value)} is no method: there are {', '.join(_METHODS)}")
-    return value
-
-
-def _alpha(value: Any, folder: Path) -> float:
-    number = _number(value)
-    if number is None or number < 0:
-        raise jd.InputError(f"{shown(value)}: give a number, 0 or more")
-    return number
-
-
-def _rigidity(value: Any, folder: Path) -> str:
-    number = _number(value)
-    if number is None:
-        return _file(value, folder)
-    if number < 0:
-        raise jd.InputError(f"{shown(value)}: give a number, 0 or more, or a PLY file")
-    return repr(number)
-
-
-def _regions(value: Any, folder: Path) -> tuple[str, ...]:
-    found = []
-    for region in _listed(value, ";"):
-        expression, _, word = str(region).rpartition(":")
-        number = _number(word)
-        if number is None or number < 0:
-            raise jd.InputError(f"{shown(region)}: give EXPR: VALUE, such as y > 0.5: 30")
-        found.append(f"{_expression(expression, folder)}: {number!r}")
-    return tuple(found)
-
-
-_READERS: dict[str, Callable[[Any, Path], Any]] = {
-    "job": _name,
-    "mesh": _file,
-    "handles": _file,
-    "fix": _expression,
-    "move": _expression,
-    "rotate": _rotation,
-    "about": _point,
-    "translate": _point,
-    "frames": _count,
-    "method": _method,
-    "rigidity": _rigidity,
-    "stiff": _regions,
-    "rings": _count,
-    "poses": _files,
-    "alpha": _alpha,
-}

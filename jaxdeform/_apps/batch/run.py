@@ -7,7 +7,7 @@ from typing import Any
 
 import jaxdeform as jd
 from jaxdeform._apps.batch import store
-from jaxdeform._apps.batch.manifest import Job
+from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.batch.store import Root
 from jaxdeform._apps.batch.worker import WorkerSettings
 

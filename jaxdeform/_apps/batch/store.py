@@ -15,7 +15,7 @@ import zarr
 from zarr.errors import GroupNotFoundError
 
 import jaxdeform as jd
-from jaxdeform._apps.batch.manifest import Job
+from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.batch.work import Done
 from jaxdeform._result import MEMBERS
 

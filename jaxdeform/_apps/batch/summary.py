@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxdeform as jd
 from jaxdeform._apps.batch import store
-from jaxdeform._apps.batch.manifest import Job
+from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.batch.store import Root
 from jaxdeform._apps.results import save_result
 from jaxdeform._mesh.files import check_output, format_of

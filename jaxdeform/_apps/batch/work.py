@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import read_material, read_pose
-from jaxdeform._apps.batch.manifest import Job
+from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.methods import Method, MethodSettings
 from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
 from jaxdeform._mesh.select import some_where
