@@ -73,8 +73,7 @@ def load_handles(
     motion = None if motion is None else read_path("motion", motion)
     suffix = path.suffix.lower()
     if suffix == ".sel":
-        beside = path.with_suffix(".def") if motion is None else motion
-        handles, targets = _parse_survey(path, beside, mesh)
+        handles, targets = _parse_survey(path, motion or motion_beside(path), mesh)
     elif suffix != ".json":
         raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
     elif motion is not None:
@@ -86,6 +85,11 @@ def load_handles(
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return HandleFile(handles, targets)
+
+
+def motion_beside(path: Path) -> Path:
+    """Return the ``.def`` file that belongs to a ``.sel`` file."""
+    return path.with_suffix(".def")
 
 
 def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 import jaxdeform as jd
 from jaxdeform._apps.methods import Method
 from jaxdeform._errors import a_or_an, shown
+from jaxdeform._handles.files import motion_beside
 from jaxdeform._mesh.expressions import matching
 from jaxdeform._mesh.words import real
 
@@ -39,6 +40,13 @@ def _file(value: Any, folder: Path) -> str:
     if not found:
         raise jd.InputError(f"there is no file {path}: check the name")
     return str(path)
+
+
+def _handles(value: Any, folder: Path) -> str:
+    name = _file(value, folder)
+    if Path(name).suffix.lower() == ".sel":
+        _file(str(motion_beside(Path(name))), folder)
+    return name
 
 
 def _files(value: Any, folder: Path) -> tuple[str, ...]:
@@ -129,7 +137,7 @@ def _regions(value: Any, folder: Path) -> tuple[str, ...]:
 READERS: dict[str, Callable[[Any, Path], Any]] = {
     "job": _name,
     "mesh": _file,
-    "handles": _file,
+    "handles": _handles,
     "fix": _expression,
     "move": _expression,
     "rotate": _rotation,

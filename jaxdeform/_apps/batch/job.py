@@ -1,10 +1,14 @@
 """A job of a batch run, and the files that it reads."""
 
+import hashlib
 import json
 import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import jaxdeform as jd
 from jaxdeform._apps.methods import Method
+from jaxdeform._handles.files import motion_beside
 
 
 class Job(NamedTuple):
@@ -49,7 +53,28 @@ class Job(NamedTuple):
     @property
     def files(self) -> list[str]:
         """The files that it reads."""
-        named = [self.mesh, self.handles, *self.poses]
+        named = [*self.files_of_problem, *self.poses]
         if self.rigidity and os.path.isabs(self.rigidity):  # else a number
             named.append(self.rigidity)
-        return [name for name in named if name]
+        return named
+
+    @property
+    def files_of_problem(self) -> list[str]:
+        """The files that jobs of one factor have in common."""
+        handles = [self.handles] if self.handles else []
+        if self.handles and Path(self.handles).suffix.lower() == ".sel":
+            handles.append(str(motion_beside(Path(self.handles))))
+        return [self.mesh, *handles]
+
+
+def digest_of(name: str) -> str:
+    """Return the digest of a file: another one where its content is another.
+
+    **Raises** InputError where it cannot be read.
+    """
+    try:
+        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
+    except OSError as error:
+        raise jd.InputError(
+            f"{name}: cannot be read ({error.strerror}): put it there again"
+        ) from error

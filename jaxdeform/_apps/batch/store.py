@@ -7,7 +7,6 @@ is done.
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ import zarr
 from zarr.errors import GroupNotFoundError
 
 import jaxdeform as jd
-from jaxdeform._apps.batch.job import Job
+from jaxdeform._apps.batch.job import Job, digest_of
 from jaxdeform._apps.batch.work import Done
 from jaxdeform._result import MEMBERS
 
@@ -118,12 +117,11 @@ def identity_of(jobs: list[Job]) -> dict[str, Any]:
     """Return what must be the same where a run goes on: jobs, files, version."""
     text = "\n".join(job.as_json() for job in jobs)
     files = sorted({name for job in jobs for name in job.files})
-    digest = lambda data: hashlib.sha256(data).hexdigest()  # noqa: E731
     return {
         "layout": LAYOUT,
         "version": jd.__version__,
-        "jobs": digest(text.encode()),
-        "files": {name: digest(Path(name).read_bytes()) for name in files},
+        "jobs": hashlib.sha256(text.encode()).hexdigest(),
+        "files": {name: digest_of(name) for name in files},
     }
 
 
@@ -137,12 +135,21 @@ def check_same(run: str, root: Root, jobs: list[Job]) -> None:
     }.items():
         if old.get(what) != new[what]:
             raise jd.InputError(f"{run}: {said}: give another folder to -o")
-    files = old["files"]
-    changed = [name for name, digest in new["files"].items() if files.get(name) != digest]
-    if changed:
-        raise jd.InputError(
-            f"{run}: the file {changed[0]} has changed since it was begun: give another folder"
-        )
+    _check_digests(run, old["files"], new["files"])
+
+
+def check_files(run: str, root: Root, names: set[str]) -> None:
+    """Raise InputError unless these files are as they were when the run was begun."""
+    _check_digests(run, root.attrs["files"], {name: digest_of(name) for name in sorted(names)})
+
+
+def _check_digests(run: str, old: dict[str, str], new: dict[str, str]) -> None:
+    for name, digest in new.items():
+        if old.get(name) != digest:
+            raise jd.InputError(
+                f"{run}: the file {name} has changed since it was begun: restore it, or begin a "
+                "run in another folder"
+            )
 
 
 def is_run(root: Root) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 import jaxdeform as jd
 from jaxdeform._apps.arguments import read_material, read_pose
-from jaxdeform._apps.batch.job import Job
+from jaxdeform._apps.batch.job import Job, digest_of
 from jaxdeform._apps.methods import Method, MethodSettings
 from jaxdeform._apps.moves import Motion, Moves, moves_by_place, moves_of_file
 from jaxdeform._mesh.select import some_where
@@ -38,13 +38,14 @@ class Done(NamedTuple):
 def do(job: Job) -> Done:
     """Do a job. **Raises** whatever is wrong with it."""
     began = time.perf_counter()
-    mesh, moves, problem = _prepared(job.problem, job)
+    mesh, moves, problem = _prepared(job)
     done = _fit(job, mesh, problem) if job.poses else _deform(job, mesh, moves, problem)
     return done._replace(seconds=time.perf_counter() - began)
 
 
+# A worker may outlive a run, and the next run may find other content under the same names.
 @lru_cache(maxsize=4)
-def _mesh(path: str) -> jd.Mesh:
+def _mesh(path: str, digest: str) -> jd.Mesh:
     return jd.load_mesh(path)
 
 
@@ -52,9 +53,11 @@ def _mesh(path: str) -> jd.Mesh:
 _kept: list[Any] = []
 
 
-def _prepared(key: tuple[Any, ...], job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
+def _prepared(job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
     """Return the mesh, the moves of this job, and the problem, which the last job may have left."""
-    mesh = _mesh(job.mesh)
+    digests = [digest_of(name) for name in job.files_of_problem]
+    key = job.problem, digests
+    mesh = _mesh(job.mesh, digests[0])
     if job.handles:
         moves = moves_of_file(mesh, Path(job.handles), None)
         handles = moves.handles

@@ -53,6 +53,7 @@ def run_block(block: store.Block, settings: WorkerSettings) -> int:
             done.append(_tried(job))
         if again:
             counts[str(row)] -= 1
+    store.check_files(settings.run, root, {name for job in block.jobs for name in job.files})
     store.write(root, block, done)
     store.forget(root, block)
     return len(done)
