@@ -9,6 +9,8 @@ import jaxdeform as jd
 from jaxdeform._estimation.found_handles import FoundHandles
 from jaxdeform._mesh.files import without_suffix
 
+RESCUED = ".rescued.ply"
+
 
 def save_result(
     out: Path, mesh: jd.Mesh, vertices: np.ndarray | None, rigidity: np.ndarray | None
@@ -17,12 +19,17 @@ def save_result(
     try:
         jd.save_mesh(out, mesh, vertices=vertices, rigidity=rigidity)
     except jd.InputError as error:
-        rescue = without_suffix(out).with_suffix(".rescued.ply")
+        rescue = rescue_of(out)
         try:
             jd.save_mesh(rescue, mesh, vertices=vertices, rigidity=rigidity)
         except jd.InputError:
             raise error from None
         raise jd.InputError(f"{error}; the result is in {rescue}") from error
+
+
+def rescue_of(out: Path) -> Path:
+    """Return the name of the file beside it that holds what its format cannot."""
+    return out.with_name(f"{without_suffix(out).name}{RESCUED}")
 
 
 def as_json(

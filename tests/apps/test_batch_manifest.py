@@ -82,6 +82,9 @@ WRONG = {
     "row 2: the job 'one' is in row 1 too": {"job": "one"},
     "row 2, job: 'a/b' cannot name a file": {"job": "a/b"},
     r"row 2, job: '\.\.' cannot name": {"job": ".."},
+    r"row 2, job: 'é+\.\.\. is too long for the name of a file: give at most 243": {
+        "job": "é" * 122
+    },
     "row 2, fix: the expression: it ends where a number": {"fix": "v <"},
     "row 2, rotate: 'q 60': give an axis and degrees": {"rotate": "q 60"},
     "row 2, translate: '1 2': give 3 numbers": {"translate": "1 2"},

@@ -9,6 +9,7 @@ import numpy as np
 
 import jaxdeform as jd
 from jaxdeform._apps.methods import Method
+from jaxdeform._apps.results import RESCUED
 from jaxdeform._errors import a_or_an, shown
 from jaxdeform._handles.files import motion_beside
 from jaxdeform._mesh.expressions import matching
@@ -22,6 +23,11 @@ def _name(value: Any, folder: Path) -> str:
     name = str(value).strip()
     if name in (".", "..") or set(name) & set('/\\:*?"<>|\0') or not name.isprintable():
         raise jd.InputError(f"{shown(name)} cannot name a file: leave out signs such as / and :")
+    if len(f"{name}{RESCUED}".encode()) > 255:  # the longest that file systems take
+        raise jd.InputError(
+            f"{shown(name)} is too long for the name of a file: give at most "
+            f"{255 - len(RESCUED)} bytes"
+        )
     return name
 
 

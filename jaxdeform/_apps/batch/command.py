@@ -14,7 +14,7 @@ import jaxdeform as jd
 from jaxdeform._apps.arguments import make_folder
 from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.batch.manifest import read_manifest
-from jaxdeform._apps.talk import console, counted, patiently, since
+from jaxdeform._apps.talk import complain, console, counted, patiently, since
 from jaxdeform._errors import printable
 
 MISSING = "jaxdeform batch needs further packages: pip install 'jaxdeform[batch]'"
@@ -98,12 +98,21 @@ def _tell(run: str) -> None:
 
 
 def _export(run: str, folder: Path, suffix: str) -> None:
-    from jaxdeform._apps.batch import summary
+    from jaxdeform._apps.batch.export import export
 
     root, jobs = _existing(run)
     make_folder(folder)
-    written = summary.export(root, jobs, folder, suffix)
-    console.print(f"wrote {written} meshes to {printable(str(folder))}")
+    written = failed = 0
+    for failure in export(run, root, jobs, folder, suffix):
+        if failure is None:
+            written += 1
+        else:
+            failed += 1
+            complain(f"jaxdeform: {failure}")
+    lost = f"; {failed} could not be written" if failed else ""
+    console.print(f"wrote {written} meshes to {printable(str(folder))}{lost}")
+    if failed:
+        raise typer.Exit(1)
 
 
 def _run(manifest: Path, out: str, options: _Options) -> None:

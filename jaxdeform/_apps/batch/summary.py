@@ -1,4 +1,4 @@
-"""What a run has come to: a table, a few words, and meshes."""
+"""What a run has come to: a table and a few words."""
 
 import io
 from pathlib import Path
@@ -6,12 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import jaxdeform as jd
 from jaxdeform._apps.batch import store
 from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.batch.store import Root
-from jaxdeform._apps.results import save_result
-from jaxdeform._mesh.files import check_output, format_of
 from jaxdeform._mesh.writing import write_atomically
 
 
@@ -85,26 +82,3 @@ def write_tables(run: str, columns: dict[str, list[Any]], as_csv: bool) -> None:
                 remote.write(file.getvalue())  # pyright: ignore[reportAttributeAccessIssue]
         else:
             write_atomically(Path(place), file.getvalue())
-
-
-def export(root: Root, jobs: list[Job], folder: Path, suffix: str) -> int:
-    """Write the mesh of each job that has one, and return how many."""
-    format_of(Path(f"x{suffix}"))
-    written = 0
-    for group in store.groups(root):
-        results, rows = group["result"][:], group["row"][:]
-        good = [p for p in range(len(rows)) if results[p] not in (store.WAITING, store.FAILED)]
-        if not good:
-            continue
-        mesh = jd.load_mesh(str(group.attrs["mesh"]))
-        for place in good:
-            vertices, rigidity = group["vertices"][place], group["rigidity"][place]
-            if jobs[rows[place]].poses:
-                vertices = mesh.vertices
-            if not np.isfinite(vertices).all():
-                continue
-            out = folder / f"{jobs[rows[place]].job}{suffix}"
-            check_output(out, mesh)
-            save_result(out, mesh, vertices, rigidity if suffix == ".ply" else None)
-            written += 1
-    return written
