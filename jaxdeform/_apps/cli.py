@@ -92,10 +92,12 @@ def _run() -> None:
         for note in getattr(error, "__notes__", []):  # where an expression is wrong
             complain(note)
         sys.exit(2)
-    except OSError as error:  # typer's own texts, such as --help
-        if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EIO):
+    except OSError:
+        # Typer writes its own texts, such as --help, to standard output, which then fails again.
+        mouth.write("\n")
+        mouth.flush()
+        if mouth.failure is None:
             raise
-        mouth.fail(error)
         _tell_failure()
     except _Interrupted:
         complain("jaxdeform: interrupted; no file was left half-written")

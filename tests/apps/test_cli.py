@@ -274,6 +274,22 @@ def test_the_result_is_written_though_nobody_listens(files, target, end):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has such a device")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_text_of_help_that_cannot_be_written(files, monkeypatch, unbuffered):
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    assert spoken_to(files, "full", "deform", "--help") == (1, FULL)
+
+
+def test_a_failure_that_is_not_of_the_output_is_not_called_one(run, files, monkeypatch):
+    def fail(path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(jd, "inspect", fail)
+    with pytest.raises(OSError, match="No space left on device"):
+        run("inspect", files / "bar.off")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has such a device")
 @pytest.mark.parametrize("target", ["closed", "full"])
 def test_every_file_is_written_though_nobody_hears_the_warnings(files, target):
     """As in ``2>&1 | true``: each frame loses a material, and says so to nobody."""

@@ -61,7 +61,7 @@ def batch(
         raise jd.InputError(f"{MISSING} (there is no {', no '.join(missing)})")
     if status is not None:
         _tell(status)
-    elif out is None:
+    elif not out:
         raise jd.InputError("give the folder of the run with -o")
     elif export is not None:
         _export(export, Path(out), f".{suffix.lstrip('.').lower()}")
@@ -83,7 +83,9 @@ class _Options(NamedTuple):
 def _existing(name: str) -> tuple[Any, list[Job]]:
     """Return the store and the jobs of a run."""
     from jaxdeform._apps.batch import store
+    from jaxdeform._apps.batch.place import check_address
 
+    check_address(name)
     root = store.find(name)
     if root is None or not store.is_run(root) or not root.attrs.get("complete"):
         raise jd.InputError(f"{name}: is no run: give the folder that -o named")
@@ -92,23 +94,27 @@ def _existing(name: str) -> tuple[Any, list[Job]]:
 
 def _tell(run: str) -> None:
     from jaxdeform._apps.batch import summary
+    from jaxdeform._apps.batch.place import readable
 
-    done, failed, total = summary.count(*_existing(run))
+    with readable(run):
+        done, failed, total = summary.count(*_existing(run))
     console.print(f"{done} of {total} jobs done, {failed} of them failed")
 
 
 def _export(run: str, folder: Path, suffix: str) -> None:
     from jaxdeform._apps.batch.export import export
+    from jaxdeform._apps.batch.place import readable
 
-    root, jobs = _existing(run)
-    make_folder(folder)
     written = failed = 0
-    for failure in export(run, root, jobs, folder, suffix):
-        if failure is None:
-            written += 1
-        else:
-            failed += 1
-            complain(f"jaxdeform: {failure}")
+    with readable(run):
+        root, jobs = _existing(run)
+        make_folder(folder)
+        for failure in export(run, root, jobs, folder, suffix):
+            if failure is None:
+                written += 1
+            else:
+                failed += 1
+                complain(f"jaxdeform: {failure}")
     lost = f"; {failed} could not be written" if failed else ""
     console.print(f"wrote {written} meshes to {printable(str(folder))}{lost}")
     if failed:
@@ -117,18 +123,26 @@ def _export(run: str, folder: Path, suffix: str) -> None:
 
 def _run(manifest: Path, out: str, options: _Options) -> None:
     from jaxdeform._apps.batch import run, summary
+    from jaxdeform._apps.batch.place import alone, check_address, is_address, readable
     from jaxdeform._apps.batch.worker import WorkerSettings
 
     began = time.perf_counter()
+    check_address(out)
     jobs = read_manifest(manifest)
-    root = patiently("planning", lambda: run.planned(out, jobs))
-    cache = bool(jax.config.values.get("jax_compilation_cache_dir"))  # cli.py has set it
-    settings = WorkerSettings(out, run.new_session(), options.tries, options.time_limit, cache)
-    go_on = partial(run.go_on, root, jobs, settings, options.scheduler, options.workers)
-    worked = counted("jobs", len(jobs), lambda tell: go_on(tell, console.print))
-    if worked or not summary.has_tables(out, options.csv):
-        summary.write_tables(out, summary.table(root, jobs), options.csv)
-    done, failed, total = summary.count(root, jobs)
+    with alone(out):
+        with readable(out):
+            root = patiently("planning", lambda: run.planned(out, jobs))
+        cache = bool(jax.config.values.get("jax_compilation_cache_dir"))  # cli.py has set it
+        place = out if is_address(out) else os.path.abspath(out)  # workers may be elsewhere
+        settings = WorkerSettings(
+            place, run.new_session(), options.tries, options.time_limit, cache
+        )
+        go_on = partial(run.go_on, root, jobs, settings, options.scheduler, options.workers)
+        worked = counted("jobs", len(jobs), lambda tell: go_on(tell, console.print))
+        with readable(out):
+            if worked or not summary.has_tables(out, options.csv):
+                summary.write_tables(out, summary.table(root, jobs), options.csv)
+            done, failed, total = summary.count(root, jobs)
     console.print(f"{done} of {total} jobs done, {failed} of them failed, in {since(began)}")
     console.print(f"wrote {printable(', '.join(summary.tables(out, options.csv)))}")
     if failed:

@@ -8,6 +8,7 @@ from typing import Any
 import jaxdeform as jd
 from jaxdeform._apps.batch import store
 from jaxdeform._apps.batch.job import Job
+from jaxdeform._apps.batch.place import LOCK, is_address, other_files, readable
 from jaxdeform._apps.batch.store import Root
 from jaxdeform._apps.batch.worker import WorkerSettings
 
@@ -16,8 +17,8 @@ def planned(run: str, jobs: list[Job]) -> Root:
     """Return the store of the run: that of an earlier try with the same jobs, or a new one."""
     root = store.find(run)
     if root is None:
-        if "://" not in run and _holds_something(Path(run)):
-            raise jd.InputError(f"{run}: is a folder with other files in it: choose a new name")
+        if not is_address(run) and _holds_something(Path(run)):
+            raise other_files(run)
         return store.make(run, jobs)
     if not store.is_run(root):
         raise jd.InputError(f"{run}: holds a Zarr store that is no run: choose a new name")
@@ -29,7 +30,7 @@ def planned(run: str, jobs: list[Job]) -> Root:
 
 def _holds_something(run: Path) -> bool:
     """Whether a folder has files in it, other than those of a run killed at its first write."""
-    files = [file for file in run.rglob("*") if not file.is_dir()]
+    files = [file for file in run.rglob("*") if not file.is_dir() and file.name != LOCK]
     begun = [file for file in files if file.parent.name == store.FOLDER]
     return len(begun) < len(files) or any(file.suffix != ".partial" for file in begun)
 
@@ -49,7 +50,8 @@ def go_on(
 
     **Raises** InputError where results cannot be written, or no worker can be had.
     """
-    listed = list(store.blocks(root, jobs))
+    with readable(settings.run):
+        listed = list(store.blocks(root, jobs))
     todo = [block for block, done in listed if not done]
     finished = len(jobs) - sum(len(block.jobs) for block in todo)
     tell(finished, len(jobs))

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxdeform._apps.batch import store
 from jaxdeform._apps.batch.job import Job
+from jaxdeform._apps.batch.place import is_address
 from jaxdeform._apps.batch.store import Root
 from jaxdeform._mesh.writing import write_atomically
 
@@ -77,7 +78,7 @@ def write_tables(run: str, columns: dict[str, list[Any]], as_csv: bool) -> None:
     for place in tables(run, as_csv):
         file = io.BytesIO()
         writers[Path(place).suffix](content, file)
-        if "://" in run:
+        if is_address(run):
             with fsspec.open(place, "wb") as remote:
                 remote.write(file.getvalue())  # pyright: ignore[reportAttributeAccessIssue]
         else:
