@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,6 +92,8 @@ WRONG = {
     "row 2, translate: 'nan 0 0': give 3 numbers": {"translate": "nan 0 0"},
     "row 2, rigidity: '-1': give a number, 0 or more": {"rigidity": "-1"},
     "row 2, rigidity: there is no file": {"rigidity": "soft"},
+    "row 2, rigidity: 'inf': give a number, 0 or more, or a PLY file": {"rigidity": "inf"},
+    "row 2, rigidity: 'nan': give a number, 0 or more, or a PLY file": {"rigidity": "nan"},
     "row 2, stiff: 'y > 1': give EXPR: VALUE": {"stiff": "y > 1"},
     "row 2, rings: '0': give a whole number": {"rings": "0"},
     "row 2, frames: '2.5': give a whole number": {"frames": "2.5"},
@@ -121,6 +124,7 @@ def test_what_is_wrong_is_named(folder, message):
         ("jobs.csv", "job,mesh\n", "has no rows"),
         ("jobs.csv", "", "is empty"),
         ("jobs.csv", "mesh\nbar.off,1,2\n", "beyond the last column"),
+        ("jobs.csv", f"mesh\n{'a' * 131_073}\n", r"read behind line 1 \(field larger than"),
         ("jobs.jsonl", "[1]\n", "line 1 is a list: give an object"),
         ("jobs.jsonl", '{"mesh"\n', "line 1 is not JSON"),
         ("jobs.jsonl", "[" * 100_000, "line 1 is not JSON"),
@@ -132,6 +136,55 @@ def test_files_that_are_no_manifest(folder, name, content, message):
     (folder / name).write_text(content)
     with pytest.raises(jd.InputError, match=message):
         read_manifest(folder / name)
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ('"rigidity": true', "row 1, rigidity: True: give a number, 0 or more, or a PLY file"),
+        ('"rigidity": [1, 2]', r"row 1, rigidity: \[1, 2\]: give a number, 0 or more, or a PLY"),
+        ('"rigidity": Infinity', "row 1, rigidity: inf: give a number, 0 or more, or a PLY file"),
+        ('"translate": [true, 0, 1]', r"row 1, translate: \[True, 0, 1\]: give 3 numbers"),
+        ('"translate": [[0], [0, 1], 1]', r"row 1, translate: .*: give 3 numbers"),
+    ],
+)
+def test_values_of_json_that_do_not_fit(folder, own, message):
+    row = json.dumps({"mesh": "bar.off", "handles": "handles.json"})
+    (folder / "jobs.jsonl").write_text(f"{row[:-1]}, {own}}}")
+    with pytest.raises(jd.InputError, match=message):
+        read_manifest(folder / "jobs.jsonl")
+
+
+def test_a_column_that_is_there_twice_is_refused(folder):
+    """Of two, one would be lost without a word."""
+    import pyarrow.parquet
+
+    (folder / "jobs.csv").write_text("mesh,handles,stiff,stiff\nbar.off,handles.json,x>0:1,x<0:2\n")
+    row = '{"mesh": "bar.off", "handles": "handles.json", "stiff": "x>0:1", "stiff": "x<0:2"}'
+    (folder / "jobs.jsonl").write_text(row)
+    column = pyarrow.array(["x>0:1"])
+    table = pyarrow.Table.from_arrays([column, column], ["stiff", "stiff"])
+    pyarrow.parquet.write_table(table, folder / "jobs.parquet")
+    for name in ("jobs.csv", "jobs.jsonl", "jobs.parquet"):
+        with pytest.raises(jd.InputError, match=r"'stiff' is there 2 times: .* separated by ;"):
+            read_manifest(folder / name)
+
+
+def test_a_table_of_pandas_with_its_index(folder):
+    (row,) = ROWS[:1]
+    path = write(folder, [row | {"__index_level_0__": 3}], "parquet")
+    with pytest.raises(jd.InputError, match=r"'__index_level_0__' is no column: .*index=False"):
+        read_manifest(path)
+
+
+def test_only_a_newline_ends_a_line_of_json(folder):
+    """U+2028 may stand in a text; to some programs it ends a line. As a rule DOS has two signs."""
+    row = {"mesh": "bar\u2028.off", "handles": "handles.json"}
+    (folder / row["mesh"]).write_bytes((folder / "bar.off").read_bytes())
+    text = "\r\n".join([json.dumps(row, ensure_ascii=False)] * 2 + [""])
+    (folder / "jobs.jsonl").write_text(text, encoding="utf-8")
+    jobs = read_manifest(folder / "jobs.jsonl")
+    assert [Path(job.mesh).name for job in jobs] == [row["mesh"]] * 2
 
 
 def test_random_bytes_are_refused_or_read(folder):

@@ -89,7 +89,9 @@ def _rotation(value: Any, folder: Path) -> tuple[str, float]:
 
 
 def _listed(value: Any, mark: str | None) -> list[Any]:
-    return value.split(mark) if isinstance(value, str) else list(np.atleast_1d(value).tolist())
+    if isinstance(value, str):
+        return value.split(mark)
+    return value if isinstance(value, list) else [value]
 
 
 def _number(word: Any) -> float | None:
@@ -121,10 +123,13 @@ def _alpha(value: Any, folder: Path) -> float:
 
 
 def _rigidity(value: Any, folder: Path) -> str:
-    number = _number(value)
-    if number is None:
-        return _file(value, folder)
-    if number < 0:
+    try:
+        number = real(str(value).strip().encode(errors="replace"))
+    except ValueError:
+        if isinstance(value, str):
+            return _file(value, folder)
+        number = -1.0
+    if not 0 <= number < math.inf:
         raise jd.InputError(f"{shown(value)}: give a number, 0 or more, or a PLY file")
     return repr(number)
 

@@ -4,7 +4,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +48,16 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
     if suffix == ".csv":
         text = io.StringIO(read_text(path), newline="")
         reader = csv.DictReader(text, restkey="(beyond the last column)")
-        yield from reader
+        try:
+            _check_once(str(path), reader.fieldnames or [])
+            yield from reader
+        except csv.Error as error:
+            raise jd.InputError(
+                f"{path}: cannot be read behind line {reader.line_num} ({error}): correct it, or "
+                "write JSON lines"
+            ) from error
     elif suffix in (".jsonl", ".ndjson"):
-        for number, line in enumerate(read_text(path).splitlines(), 1):
+        for number, line in enumerate(read_text(path).split("\n"), 1):
             if line.strip():
                 yield _object(path, number, line)
     elif suffix == ".parquet":
@@ -57,16 +65,35 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
 
         data = io.BytesIO(read_bytes(path))
         try:
-            yield from pyarrow.parquet.read_table(data).to_pylist()
+            file = pyarrow.parquet.ParquetFile(data)
+            columns, rows = file.schema_arrow.names, file.read().to_pylist()
         except (OSError, ValueError) as error:
             raise jd.InputError(f"{path}: is no Parquet file ({error}): write it again") from error
+        _check_once(str(path), columns)
+        yield from rows
     else:
         raise jd.InputError(f"{path}: is no manifest: give a .csv, .jsonl or .parquet file")
 
 
+def _check_once(where: str, columns: Sequence[str]) -> None:
+    """Raise InputError where a column is there twice: only one of them would be read."""
+    for column, times in Counter(columns).items():
+        if times > 1:
+            raise jd.InputError(
+                f"{where}: the column {shown(column)} is there {times} times: give it once "
+                "(several regions or poses go into one cell, separated by ;)"
+            )
+
+
 def _object(path: Path, number: int, line: str) -> dict[str, Any]:
+    def read(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        _check_once(f"{path}: line {number}", [key for key, _ in pairs])
+        return dict(pairs)
+
     try:
-        row = json.loads(line)
+        row = json.loads(line, object_pairs_hook=read)
+    except jd.InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise jd.InputError(f"{path}: line {number} is not JSON ({error})") from error
     if not isinstance(row, dict):
@@ -81,8 +108,10 @@ def _job(
     values: dict[str, Any] = {"job": str(number)}
     for column, value in row.items():
         if column not in READERS:
-            columns = ", ".join(READERS)
-            raise jd.InputError(f"{where}: {shown(column)} is no column: there are {columns}")
+            move = f"there are {', '.join(READERS)}"
+            if column.startswith("__index_level_"):  # as pandas writes it
+                move = "write the table with index=False"
+            raise jd.InputError(f"{where}: {shown(column)} is no column: {move}")
         blank = value is None or value == [] or (isinstance(value, str) and not value.strip())
         if not blank and not (isinstance(value, float) and math.isnan(value)):
             key = column, repr(value)
