@@ -84,6 +84,28 @@ def test_a_file_that_is_gone_ends_the_run(files, jobs):
     assert summary.count(root, own).done == 0
 
 
+LIFT, FIT = {"translate": "0 0 1"}, {"poses": "bar.off", "rigidity": None}
+HELD = {"fix": "v < 0.1", "move": "v > 0.9"}
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (LIFT | HELD | {"fix": "x < -500"}, "fix: 'x < -500' holds for no vertex"),
+        (LIFT | HELD | {"move": "x < -500"}, "move: 'x < -500' holds for no vertex"),
+        (LIFT | HELD | {"stiff": "x < -500: 1"}, "stiff: 'x < -500' holds for no vertex"),
+        (LIFT | {"fix": "x < 500", "move": "x < 500"}, "fix and move both choose 722 vertices"),
+        (FIT | HELD | {"fix": "x < -500"}, "fix: 'x < -500' holds for no vertex"),
+        (FIT | HELD | {"move": "x < -500"}, "move: 'x < -500' holds for no vertex"),
+    ],
+)
+def test_errors_name_the_column_and_no_option(files, jobs, own, message):
+    own = jobs({"handles": None} | own)
+    (error,) = store.errors_of(do_all(files / "run", own)).values()
+    assert error.startswith(message)
+    assert "--" not in error
+
+
 def test_a_motion_that_is_missing_beside_its_handles_is_named_at_once(files, jobs):
     (files / "bend.def").unlink()
     with pytest.raises(jd.InputError, match=r"row 1, handles: there is no file .*bend\.def"):

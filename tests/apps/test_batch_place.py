@@ -79,6 +79,36 @@ def test_two_commands_at_once(files, manifest):
             assert "1 of 1 jobs done, 0 of them failed" in out
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signal to a process")
+def test_an_interrupted_command_says_one_line(files, manifest):
+    manifest.write_text("\n".join([manifest.read_text()] * 1000))
+    main = "from jaxdeform._apps.cli import main; main()"
+    words = [sys.executable, "-c", main, "batch", str(manifest), "-o", str(files / "run")]
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **piped) as command:
+        assert command.stdout is not None
+        assert "dashboard" in command.stdout.readline()
+        command.send_signal(signal.SIGINT)
+        _, err = command.communicate(timeout=200)
+    assert command.returncode == 130
+    assert err == "jaxdeform: interrupted; no file was left half-written\n"
+
+
+def test_workers_in_another_folder_find_the_run(run, files, manifest, monkeypatch):
+    """Those of a scheduler were started elsewhere."""
+    seen = []
+
+    def go_on(root, jobs, settings, *rest):
+        seen.append(settings.run)
+        return False
+
+    monkeypatch.setattr(runs, "go_on", go_on)
+    monkeypatch.chdir(files)
+    code, _, err = run("batch", manifest, "-o", "run", "--scheduler", "tcp://127.0.0.1:1")
+    assert (code, err, seen) == (0, "", [str(files / "run")])
+
+
 def test_a_folder_of_the_user_stays_as_it_is(run, files, manifest):
     before = sorted(files.rglob("*"))
     said = one_line(run("batch", manifest, "-o", files))

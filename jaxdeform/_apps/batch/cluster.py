@@ -1,6 +1,7 @@
 """The workers of a batch run: blocks are handed out, and given again where a worker is lost."""
 
 import logging
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -69,6 +70,8 @@ def _client(
             say(f"dashboard: {client.dashboard_link}")
             yield client
         return
+    # After Ctrl-C the tracker of multiprocessing tidies up, and would tell of every semaphore.
+    sys.warnoptions.append("ignore:resource_tracker:UserWarning")
     with dask.config.set(
         {
             # A block that loses its worker is tried again; worker.py counts how often.

@@ -62,7 +62,8 @@ def _prepared(job: Job) -> tuple[jd.Mesh, Moves | None, jd.Problem]:
         moves = moves_of_file(mesh, Path(job.handles), None)
         handles = moves.handles
     elif job.poses:
-        chosen = [some_where(mesh, x, "fix or move") for x in (job.fix, job.move) if x]
+        named = {"fix": job.fix, "move": job.move}
+        chosen = [some_where(mesh, x, name) for name, x in named.items() if x]
         moves, handles = None, np.unique(np.concatenate([x.vertices for x in chosen]))
     else:
         motion = Motion(job.rotate, job.about, job.translate)  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,7 @@
 """What a worker does: one block of jobs, of which a bad one does not end the others."""
 
 import os
+import re
 import threading
 import traceback
 from collections.abc import Iterator
@@ -11,7 +12,11 @@ import jax
 
 import jaxdeform as jd
 from jaxdeform._apps.batch import store
+from jaxdeform._apps.batch.job import Job
 from jaxdeform._apps.batch.work import Done, do
+
+# What the command `deform` has as options is columns here, of the same names.
+_OPTION = re.compile(rf"(?<!\S)--({'|'.join(Job._fields)})\b")
 
 
 class WorkerSettings(NamedTuple):
@@ -63,7 +68,7 @@ def _tried(job) -> Done | str:
     try:
         return do(job)
     except jd.InputError as error:
-        return str(error)
+        return _OPTION.sub(r"\1", str(error))
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {error} ({where.name}, line {where.lineno})"
