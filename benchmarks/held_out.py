@@ -96,8 +96,9 @@ def error(problem: jd.Problem, unseen, rigidity, local: Any = None) -> float:
     return 100.0 * float(prediction_errors(problem, unseen, rigidity, local or jd.Newton()).mean())
 
 
-def solid_errors(bar: Bar) -> dict[str, float]:
-    """Return the mean error of each way to predict a solid."""
+def solid_errors(young) -> dict[str, float]:
+    """Return the mean error of each way to predict a solid, as in `make_bar`."""
+    bar = make_bar(young)
     problem, seen, unseen = bar.problem, bar.stack(FITTED), bar.stack(HELD_OUT)
     targets = seen[:, problem.handles]
     halves = jd.estimate_rigidity(problem, seen, targets=targets, parts=bar.upper)
@@ -142,10 +143,7 @@ def main() -> None:
         "halves of 1 and 10": lambda height: np.where(height > 0.5, 10.0, 1.0),
         "a band of 10 in 1": lambda height: np.where(np.abs(height - 0.5) < 0.17, 10.0, 1.0),
     }
-    rows = {
-        name: partial(lambda young: solid_errors(make_bar(young)), young)
-        for name, young in solids.items()
-    }
+    rows = {name: partial(solid_errors, young) for name, young in solids.items()}
     if len(sys.argv) > 1:
         rows = scans(Path(sys.argv[1]))
     for number, (name, errors) in enumerate(rows.items()):

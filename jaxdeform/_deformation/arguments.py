@@ -168,15 +168,14 @@ def read_geometry(
     """
     cells, dtype = problem.own_cells, problem.dtype
     graph = graph_of(cells, dtype)
-    moved = problem.vertices if rest is None else rest
-    moved = as_array(moved, dtype, "rest")
-    weights = cells.weights if edge_weights is None else edge_weights
-    weights = as_array(weights, dtype, "edge_weights")
     own = (
-        ("rest", moved, problem.vertices, "vertex"),
-        ("edge_weights", weights, cells.weights, "edge"),
+        ("rest", rest, problem.vertices, "vertex"),
+        ("edge_weights", edge_weights, cells.weights, "edge"),
     )
-    for name, given, known, unit in own:
+    for name, value, known, unit in own:
+        if value is None:
+            continue
+        given = as_array(value, dtype, name)
         if given.shape != known.shape:
             raise InputError(f"{name} {have(name)} shape {given.shape}, expected {known.shape}")
         if is_concrete(given):
@@ -188,4 +187,6 @@ def read_geometry(
                     "are given only for derivatives; call precompute for another rest shape"
                 )
     at = problem.system.rest if rest is None else read_vertices(problem, "rest", rest)
+    weights = cells.weights if edge_weights is None else edge_weights
+    weights = as_array(weights, dtype, "edge_weights")
     return geometry_of(graph, jnp.asarray(at), weights, edge_weights is not None)

@@ -57,6 +57,11 @@ def states(problem: Problem, poses: Poses, field, solver: Solver, adjoint: Adjoi
     return found
 
 
+def positions_of(ends: list[State]) -> Float[np.ndarray, "poses vertices 3"]:
+    """Return where the vertices are."""
+    return np.stack([np.asarray(end.vertices) for end in ends])
+
+
 class Known(NamedTuple):
     """A pose whose state is known, in arrays of the size of the problem's bucket.
 
@@ -118,7 +123,7 @@ def deform_all(problem, poses: Poses, label, theta, solver, adjoint) -> PoseDeri
     vertices = (np.swapaxes(relative[..., :count], 1, 2) + problem.mesh.center).astype(theta.dtype)
     jacobian = np.swapaxes(slopes[:, :, :count], 1, 2)
     counted = poses.counted[..., None]
-    error = np.stack([np.asarray(state.vertices) for state in ends]) - vertices
+    error = positions_of(ends) - vertices
     return PoseDerivatives(
         vertices,
         np.where(counted[..., None], jacobian, 0.0),

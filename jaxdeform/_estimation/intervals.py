@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxdeform._estimation.bounded_gauss_newton import box_solver
-from jaxdeform._estimation.deformed import State
+from jaxdeform._estimation.deformed import State, positions_of
 from jaxdeform._estimation.noise import random_effects
 from jaxdeform._estimation.part_model import Fit, PartModel
 from jaxdeform._estimation.poses import same_length
@@ -95,9 +95,9 @@ def extremes(model: PartModel, best: Fit) -> Extremes:
     for k in range(len(best.theta)):
         thetas = np.where(np.arange(len(best.theta)) == k, model.bounds, best.theta)
         ends = all_ends if len(best.theta) == 1 else [model.ends(theta) for theta in thetas]
-        moved[k] = [distances(_positions(end), best.vertices).max() for end in ends]
+        moved[k] = [distances(positions_of(end), best.vertices).max() for end in ends]
         felt[k] = _is_felt(model, best, thetas, ends)
-    far = distances(*map(_positions, all_ends))
+    far = distances(*map(positions_of, all_ends))
     return Extremes(moved, float(np.sqrt(np.sum(far**2) / model.poses.count)), felt)
 
 
@@ -109,7 +109,7 @@ def _is_felt(model: PartModel, best: Fit, thetas: np.ndarray, ends: list[list[St
     """
     poses, noise = model.poses, best.noise
     square = best.cost / max(poses.count - len(best.theta), 1) * noise.relative**2
-    soft, stiff = (np.where(poses.counted[..., None], _positions(end), 0.0) for end in ends)
+    soft, stiff = (np.where(poses.counted[..., None], positions_of(end), 0.0) for end in ends)
     white = noise.whiten((soft - stiff).reshape(len(soft), -1, 1))
     far = float(np.sum(white**2))
     if not noise.relative or far > _SURELY_FELT * square * poses.targets.size:
@@ -121,7 +121,3 @@ def _is_felt(model: PartModel, best: Fit, thetas: np.ndarray, ends: list[list[St
     )
     effects = noise.whiten(soft - stiff)
     return bool(far > _FELT * square * np.sum(effects**2) / effects.shape[-1])
-
-
-def _positions(ends: list[State]) -> Float[np.ndarray, "poses vertices 3"]:
-    return np.stack([np.asarray(end.vertices) for end in ends])

@@ -85,8 +85,9 @@ def find_handle_noise(
     """
     count = min(_MODES, poses.targets[0].size)
     motions = partial(_motions, count=count, solver=solver, adjoint=_no_finer(adjoint, _FINDING))
-    found = [motions(*pose) for pose in _known_poses(problem, poses, field, ends)]
-    modes = _effects(problem, poses, field, ends, solver, adjoint, np.asarray(found))
+    known = _known_poses(problem, poses, field, ends)
+    found = np.asarray([motions(*pose) for pose in known])
+    modes = _effects(problem, known, found, solver, adjoint)
     basis, size, _ = np.linalg.svd(modes, full_matrices=False)
     return HandleNoise(basis, relative * size, relative)
 
@@ -101,21 +102,21 @@ def random_effects(
     shape = len(poses.targets), _AT_ONCE, 3, problem.bucket
     motions = np.random.default_rng(0).standard_normal(shape)
     is_handle = np.isin(np.arange(problem.bucket), problem.handles)
-    return _effects(problem, poses, field, ends, solver, adjoint, np.where(is_handle, motions, 0.0))
+    known = _known_poses(problem, poses, field, ends)
+    return _effects(problem, known, np.where(is_handle, motions, 0.0), solver, adjoint)
 
 
 def _effects(
-    problem, poses: Poses, field, ends: list[State], solver, adjoint, motions
+    problem, known: list[tuple[Any, ...]], motions, solver, adjoint
 ) -> Float[np.ndarray, "poses coordinates motions"]:
     """Return how motions of the handles (poses, motions, 3, vertices) move the free vertices."""
     adjoint = _no_finer(adjoint, _MEASURING)
-    given = _known_poses(problem, poses, field, ends)
     moved = [
         [
             np.asarray(_moved(*pose, some, solver, adjoint))
             for some in np.split(own.astype(problem.dtype), range(_AT_ONCE, len(own), _AT_ONCE))
         ]
-        for pose, own in zip(given, motions, strict=True)
+        for pose, own in zip(known, motions, strict=True)
     ]
     out = np.stack([np.concatenate(own) for own in moved]).astype(np.float64)
     out = np.moveaxis(out[..., : problem.n_vertices], 1, -1)

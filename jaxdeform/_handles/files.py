@@ -71,10 +71,10 @@ def load_handles(
     path = read_path("path", path)
     check_type("mesh", mesh, Mesh)
     motion = None if motion is None else read_path("motion", motion)
-    suffix = path.suffix.lower()
-    if suffix == ".sel":
-        handles, targets = _parse_survey(path, motion or motion_beside(path), mesh)
-    elif suffix != ".json":
+    beside = motion_beside(path)
+    if beside is not None:
+        handles, targets = _parse_survey(path, motion or beside, mesh)
+    elif path.suffix.lower() != ".json":
         raise InputError(f"{path}: handle files end in .json or .sel, not '{path.suffix}'")
     elif motion is not None:
         raise InputError(f"{path}: a .json file holds its motions itself: leave out {motion}")
@@ -87,9 +87,9 @@ def load_handles(
     return HandleFile(handles, targets)
 
 
-def motion_beside(path: Path) -> Path:
-    """Return the ``.def`` file that belongs to a ``.sel`` file."""
-    return path.with_suffix(".def")
+def motion_beside(path: Path) -> Path | None:
+    """Return the ``.def`` file that belongs to a ``.sel`` file; other handle files have none."""
+    return path.with_suffix(".def") if path.suffix.lower() == ".sel" else None
 
 
 def _parse_json(path: Path, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from batch_runs import do_all
 from helpers import lower_and_upper
 
 import jaxdeform as jd
@@ -25,14 +26,6 @@ def jobs(files):
         return read_manifest(files / "jobs.jsonl")
 
     return jobs
-
-
-def do_all(run, jobs):
-    """Do all jobs in this process, and return the store."""
-    root = runs.planned(str(run), jobs)
-    for block, _ in list(store.blocks(root, jobs)):
-        run_block(block, WorkerSettings(str(run), "a", 3, 600.0, False))
-    return root
 
 
 def test_a_worker_that_outlives_a_run_sees_other_content_under_the_same_names(files, jobs, bar):

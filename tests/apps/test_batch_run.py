@@ -13,13 +13,14 @@ import numpy as np
 import psutil
 import pytest
 import zarr
+from batch_runs import do_all, settings
 from zarr.storage import LocalStore
 
 import jaxdeform as jd
 from jaxdeform._apps.batch import run as runs
 from jaxdeform._apps.batch import store, summary
 from jaxdeform._apps.batch.manifest import read_manifest
-from jaxdeform._apps.batch.worker import WorkerSettings, run_block
+from jaxdeform._apps.batch.worker import run_block
 
 KILLS = int(os.environ.get("JAXDEFORM_KILLS", "20"))
 
@@ -53,19 +54,6 @@ def write(path, rows) -> None:
 @pytest.fixture(scope="module")
 def jobs(folder):
     return read_manifest(folder / "jobs.jsonl")
-
-
-def settings(run, session="a", tries=3) -> WorkerSettings:
-    return WorkerSettings(str(run), session, tries, 600.0, False)
-
-
-def do_all(run, jobs, session="a"):
-    """Do what is not done, in this process."""
-    root = runs.planned(str(run), jobs)
-    for block, done in list(store.blocks(root, jobs)):
-        if not done:
-            run_block(block, settings(run, session))
-    return root
 
 
 @pytest.fixture(scope="module")

@@ -50,8 +50,9 @@ def _file(value: Any, folder: Path) -> str:
 
 def _handles(value: Any, folder: Path) -> str:
     name = _file(value, folder)
-    if Path(name).suffix.lower() == ".sel":
-        _file(str(motion_beside(Path(name))), folder)
+    beside = motion_beside(Path(name))
+    if beside is not None:
+        _file(str(beside), folder)
     return name
 
 
@@ -95,11 +96,16 @@ def _listed(value: Any, mark: str | None) -> list[Any]:
 
 
 def _number(word: Any) -> float | None:
+    number = _real(word)
+    return number if number is not None and math.isfinite(number) else None
+
+
+def _real(word: Any) -> float | None:
+    """Return the number of a word, which may be infinite or NaN."""
     try:
-        number = real(str(word).strip().encode(errors="replace"))
+        return real(str(word).strip().encode(errors="replace"))
     except ValueError:
         return None
-    return number if math.isfinite(number) else None
 
 
 def _count(value: Any, folder: Path) -> int:
@@ -123,13 +129,10 @@ def _alpha(value: Any, folder: Path) -> float:
 
 
 def _rigidity(value: Any, folder: Path) -> str:
-    try:
-        number = real(str(value).strip().encode(errors="replace"))
-    except ValueError:
-        if isinstance(value, str):
-            return _file(value, folder)
-        number = -1.0
-    if not 0 <= number < math.inf:
+    number = _real(value)
+    if number is None and isinstance(value, str):
+        return _file(value, folder)
+    if number is None or not 0 <= number < math.inf:
         raise jd.InputError(f"{shown(value)}: give a number, 0 or more, or a PLY file")
     return repr(number)
 

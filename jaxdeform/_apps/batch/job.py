@@ -61,10 +61,8 @@ class Job(NamedTuple):
     @property
     def files_of_problem(self) -> list[str]:
         """The files that jobs of one factor have in common."""
-        handles = [self.handles] if self.handles else []
-        if self.handles and Path(self.handles).suffix.lower() == ".sel":
-            handles.append(str(motion_beside(Path(self.handles))))
-        return [self.mesh, *handles]
+        named = [self.mesh, self.handles, self.handles and motion_beside(Path(self.handles))]
+        return [str(name) for name in named if name]
 
 
 def digest_of(name: str) -> str:
